@@ -267,23 +267,12 @@ def track(items: Iterable[Item], description: str, total: int | None = None) -> 
             update(done)
 
 
-class JobsView:
-    """Shows jobs: a bar for all of them and one for each that runs.
+class _Display:
+    """Bars on a terminal while a block runs, nothing elsewhere; a context manager."""
 
-    Elsewhere than on a terminal a line of text says that a job begins, and one that it has ended.
-    A context manager. Jobs that run one after another are told to `turn`. An engine that runs
-    several at once calls `begin`, then `start`, `steps`, `end` and `drop` with the index of a job,
-    from any thread.
-    """
-
-    def __init__(self, *, quiet: bool = False) -> None:
-        self._quiet = quiet
-        self._bars = new_bars() if on_terminal(sys.stderr) and not quiet else None
+    def __init__(self, *, shown: bool = True) -> None:
+        self._bars = new_bars() if shown and on_terminal(sys.stderr) else None
         self._all: TaskID | None = None
-        #: When each job that runs has begun, and its bar.
-        self._running: dict[int, tuple[float, TaskID | None]] = {}
-        self._durations: list[float] = []
-        self._count = self._ended = 0
         self._began = time.perf_counter()
 
     def __enter__(self) -> Self:
@@ -294,6 +283,24 @@ class JobsView:
     def __exit__(self, *_: object) -> None:
         if self._bars is not None:
             self._bars.stop()
+
+
+class JobsView(_Display):
+    """Shows jobs: a bar for all of them and one for each that runs.
+
+    Elsewhere than on a terminal a line of text says that a job begins, and one that it has ended.
+    Jobs that run one after another are told to `turn`. An engine that runs
+    several at once calls `begin`, then `start`, `steps`, `end` and `drop` with the index of a job,
+    from any thread.
+    """
+
+    def __init__(self, *, quiet: bool = False) -> None:
+        super().__init__(shown=not quiet)
+        self._quiet = quiet
+        #: When each job that runs has begun, and its bar.
+        self._running: dict[int, tuple[float, TaskID | None]] = {}
+        self._durations: list[float] = []
+        self._count = self._ended = 0
 
     def turn(self, index: int, count: int, text: str) -> Callable[[int, int], None]:
         """Begin job `index` of `count`, after the one before it has ended."""
@@ -417,31 +424,28 @@ def left_text(seconds: float | None) -> str:
     return "" if seconds is None else f", about {clock(seconds)} left"
 
 
-class StagesView:
+class StagesView(_Display):
     """Shows stages of unequal length, one after the other, and how much is left of all.
 
     On a terminal one bar for all of them, and below it those that `progress` and `track` show
-    within a stage; elsewhere a line at the beginning of each. A context manager.
+    within a stage; elsewhere a line at the beginning of each.
     """
 
     def __init__(self) -> None:
-        self._bars = new_bars() if on_terminal(sys.stderr) else None
-        self._all: TaskID | None = None
-        self._began = self._stage_began = time.perf_counter()
+        super().__init__()
+        self._stage_began = self._began
         self._left: tuple[float, float] = (0.0, 0.0)
         self._outer: Token[Shows | None] | None = None
 
     def __enter__(self) -> Self:
         if self._bars is not None:
-            self._bars.start()
             self._outer = OUTER.set(self.part)
-        return self
+        return super().__enter__()
 
     def __exit__(self, *_: object) -> None:
         if self._outer is not None:
             OUTER.reset(self._outer)
-        if self._bars is not None:
-            self._bars.stop()
+        super().__exit__()
 
     def stage(self, number: int, count: int, text: str, *, own: float, later: float) -> None:
         """Begin a stage."""

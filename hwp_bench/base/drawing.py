@@ -45,14 +45,12 @@ def sheet(tiles: Sequence[np.ndarray], columns: int) -> np.ndarray:
     return page
 
 
-def outlined(
-    image: np.ndarray, mask: np.ndarray, colour: tuple[int, int, int] = (0, 255, 80)
-) -> np.ndarray:
+def outlined(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """Return an image (H, W, 3) with the outline of a mask (H, W), whose inside is above 127."""
     contours, _ = cv2.findContours(
         (mask > 127).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE
     )
-    return cv2.drawContours(image.copy(), contours, -1, colour, 1, cv2.LINE_8)
+    return cv2.drawContours(image.copy(), contours, -1, (0, 255, 80), 1, cv2.LINE_8)
 
 
 def error_map(prediction: np.ndarray, target: np.ndarray, mask: np.ndarray) -> np.ndarray:

@@ -58,12 +58,12 @@ class SkinSpace:
         return read(self.mean), read(self.components)
 
 
-def shipped_skins(path: Path = FILE) -> SkinSpace:
+def shipped_skins() -> SkinSpace:
     """Read the space."""
-    arrays = read_npz(path, max_bytes=_MOST_BYTES)
+    arrays = read_npz(FILE, max_bytes=_MOST_BYTES)
     mean, steps, scales = (arrays.get(name) for name in ("mean", "components", "scales"))
     if mean is None or steps is None or scales is None or steps.shape[1:] != mean.shape:
-        raise BadInput("is not a space of textures", where=path)
+        raise BadInput("is not a space of textures", where=FILE)
     components = steps.astype(np.float32) * scales[:, None, None, None]
     return SkinSpace(
         torch.from_numpy(mean.astype(np.float32)), torch.from_numpy(components.astype(np.float32))
