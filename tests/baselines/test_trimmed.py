@@ -1,5 +1,5 @@
-"""A fit that leaves outliers out. Oracles: numpy's quantiles, the rules in loops, gratings, frames with
-an object before the hand."""
+"""A fit that leaves outliers out. Oracles: numpy's quantiles, the rules in loops, gratings, frames
+with an object before the hand."""
 
 from __future__ import annotations
 
