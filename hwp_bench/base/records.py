@@ -117,8 +117,7 @@ def _strict(hint: Any, metadata: Mapping[str, Any], rules: Rules) -> Any:
     elif dataclasses.is_dataclass(hint):
         strict = strict_twin(typing.cast("type", hint), rules)
     elif hint in (int, float):
-        metas = tuple(_without_denormals(meta) for meta in metas)
-        metas = (*metas, *_bounds(hint, metas, metadata.get("range", (rules.low, rules.high))))
+        metas = (_bounds(hint, metas, metadata.get("range", (rules.low, rules.high))),)
         strict = hint
     elif hint is str:
         if not any(isinstance(meta, Meta) and meta.pattern for meta in metas):
@@ -138,33 +137,24 @@ def _strict(hint: Any, metadata: Mapping[str, Any], rules: Rules) -> Any:
     return Annotated[(strict, *metas)] if metas else strict
 
 
-def _without_denormals(meta: Any) -> Any:
-    """The same bounds where denormals are flushed to zero.
-
-    `msgspec` takes "above 0" for "at least the smallest float". That is a denormal, which is equal
-    to 0 where they are flushed, so that 0 would pass.
-    """
-    changed: dict[str, Any] = {}
-    if isinstance(meta.gt, float) and meta.gt == 0.0:
-        changed |= {"gt": None, "ge": _LEAST}
-    if isinstance(meta.lt, float) and meta.lt == 0.0:
-        changed |= {"lt": None, "le": -_LEAST}
-    if not changed:
-        return meta
-    names = ("gt", "ge", "lt", "le", "description")
-    return Meta(**{name: getattr(meta, name) for name in names} | changed)
-
-
-def _bounds(kind: type, metas: tuple[Any, ...], limits: tuple[float, float]) -> Iterator[Meta]:
-    # The largest float keeps infinity out, and NaN is above no bound.
+def _bounds(kind: type, metas: tuple[Any, ...], limits: tuple[float, float]) -> Meta:
+    """The bounds of a number: its own, or else the limits; every float is finite."""
     own = _limits(metas)
     low, high = (-math.inf, math.inf) if own else limits
     if kind is float:
+        # The largest float keeps infinity out, and NaN is above no bound.
         low, high = max(low, -_LARGEST), min(high, _LARGEST)
+        # `msgspec` takes "above 0" for "at least the smallest float". That is a denormal, which is
+        # equal to 0 where they are flushed, so that 0 would pass.
+        if own.get("gt") == 0.0:
+            own = {name: own[name] for name in own if name != "gt"} | {"ge": _LEAST}
+        if own.get("lt") == 0.0:
+            own = {name: own[name] for name in own if name != "lt"} | {"le": -_LEAST}
     if math.isfinite(low) and not {"ge", "gt"} & own.keys():
-        yield Meta(ge=kind(low))
+        own["ge"] = kind(low)
     if math.isfinite(high) and not {"le", "lt"} & own.keys():
-        yield Meta(le=kind(high))
+        own["le"] = kind(high)
+    return Meta(**own)
 
 
 def _limits(metas: Iterable[Any]) -> dict[str, Any]:
@@ -257,7 +247,7 @@ def _expected(kind: Any, metas: tuple[Any, ...]) -> str:
         size = f"at least {least:,}" if most is None else f"{least:,} to {most:,}"
         return f"{words[origin or kind]} of {size} {'characters' if kind is str else 'entries'}"
     sides = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
-    # The bounds of `_without_denormals` and of every float are no words.
+    # What `_bounds` has for 0 and for every float are no words.
     strict = {("ge", _LEAST): ("gt", 0.0), ("le", -_LEAST): ("lt", 0.0)}
     found = (strict.get(item, item) for item in rules.items() if abs(item[1]) < _LARGEST)
     limits: dict[str, float] = dict(found)
