@@ -12,7 +12,7 @@ import hashlib
 import itertools
 import os
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from pathlib import Path
 from types import ModuleType
@@ -268,9 +268,19 @@ QUALITY = 18
 _MATRIX, _PRIMARIES, _TRANSFER, _LIMITED = 6, 1, 1, 1
 
 
-def check_encoder() -> None:
-    """Refuse to begin minutes of work whose video could not be written."""
-    _library()
+def check_encoder() -> ModuleType:
+    """Refuse to begin minutes of work whose video could not be written; returns PyAV."""
+    try:
+        import av
+
+        av.codec.Codec(ENCODER, "w")
+    except (ImportError, ValueError) as error:
+        raise MissingDependency(
+            "nothing here can encode H.264, which videos are written in",
+            remedy="Install PyAV: pip install av",
+        ) from error
+    library: ModuleType = av
+    return library
 
 
 def write_movie(path: str | os.PathLike[str], frames: Iterable[np.ndarray], fps: float) -> Path:
@@ -283,7 +293,7 @@ def write_movie(path: str | os.PathLike[str], frames: Iterable[np.ndarray], fps:
             sizes: an odd row or column at the end is doubled.
     """
     path = Path(path)
-    av = _library()
+    av = check_encoder()
     partial = path.with_name(f".{os.getpid()}.{path.stem}.mp4")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -298,9 +308,8 @@ def write_movie(path: str | os.PathLike[str], frames: Iterable[np.ndarray], fps:
 
 
 def _encode(
-    av: ModuleType, partial: Path, frames: Iterable[np.ndarray], fps: float, path: Path
+    av: ModuleType, partial: Path, frames: Iterator[np.ndarray], fps: float, path: Path
 ) -> None:
-    frames = iter(frames)
     first = next(frames, None)
     if first is None:
         raise ShapeMismatch("a video needs a frame", where=path)
@@ -343,17 +352,3 @@ def yuv_planes(image: np.ndarray) -> np.ndarray:
     rows, columns = image.shape[0] % 2, image.shape[1] % 2
     even = np.pad(image, ((0, rows), (0, columns), (0, 0)), mode="edge")
     return np.asarray(cv2.cvtColor(even, cv2.COLOR_RGB2YUV_I420))
-
-
-def _library() -> ModuleType:
-    try:
-        import av
-
-        av.codec.Codec(ENCODER, "w")
-    except (ImportError, ValueError) as error:
-        raise MissingDependency(
-            "nothing here can encode H.264, which videos are written in",
-            remedy="Install PyAV: pip install av",
-        ) from error
-    library: ModuleType = av
-    return library
