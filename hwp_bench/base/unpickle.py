@@ -123,7 +123,7 @@ class _Memo(dict[int, Any]):
 #: Python's own reader, whose every step can be changed.
 _Reader: Any = pickle._Unpickler
 #: The steps that are taken: those of files of plain data.
-_STEPS = (
+_NAMES = (
     "PROTO FRAME STOP MARK POP POP_MARK DUP MEMOIZE PUT BINPUT LONG_BINPUT GET BINGET LONG_BINGET "
     "NONE NEWTRUE NEWFALSE INT BININT BININT1 BININT2 LONG LONG1 LONG4 FLOAT BINFLOAT STRING "
     "BINSTRING SHORT_BINSTRING UNICODE BINUNICODE SHORT_BINUNICODE BINUNICODE8 BINBYTES "
@@ -131,6 +131,7 @@ _STEPS = (
     "APPEND APPENDS EMPTY_DICT DICT SETITEM SETITEMS GLOBAL STACK_GLOBAL REDUCE NEWOBJ BUILD "
     "PERSID BINPERSID"
 )
+_STEPS = frozenset(getattr(pickle, name)[0] for name in _NAMES.split())
 
 
 class _Unpickler(_Reader):
@@ -146,31 +147,22 @@ class _Unpickler(_Reader):
         self._classes: dict[str, type[StandIn]] = {}
 
     def __getitem__(self, code: int) -> Callable[[Any], None]:
-        """The function that takes the next step."""
+        """The function that takes the next step, where its objects are in order."""
         self._left -= 1
         if self._left < 0:
             raise ValueError(f"more than {self._most:,} steps")
-        if code not in _DISPATCH:
+        if code not in _STEPS:
             raise ValueError(f"step {bytes([code])!r} is not one of plain data")
-        return _DISPATCH[code]
-
-    def integer(self, load: Callable[[Any], None]) -> None:
-        """Take a step that makes an integer of any size."""
-        load(self)
-        if abs(self.stack[-1]) > _LARGEST_INTEGER:
+        if any(isinstance(one, int) and abs(one) > _LARGEST_INTEGER for one in self.stack[-1:]):
             raise ValueError("an absurdly large integer")
-
-    def entries(self, load: Callable[[Any], None], keys: list[Any]) -> None:
-        """Take a step that sets entries of a table."""
-        if any(not isinstance(key, str | bytes | int | float | None) for key in keys):
-            raise ValueError("a key of a table is neither a text nor a number")
-        load(self)
-
-    def state(self, load: Callable[[Any], None]) -> None:
-        """Take a step that gives an object its state."""
-        if not isinstance(self.stack[-2], StandIn | _Dtype | _Array):
+        if code in (pickle.SETITEM[0], pickle.SETITEMS[0], pickle.DICT[0]):
+            keys = self.stack[-2:-1] if code == pickle.SETITEM[0] else self.stack[::2]
+            if any(not isinstance(key, str | bytes | int | float | None) for key in keys):
+                raise ValueError("a key of a table is neither a text nor a number")
+        if code == pickle.BUILD[0] and not isinstance(self.stack[-2], StandIn | _Dtype | _Array):
             raise TypeError("a state of something that has none")
-        load(self)
+        taken: dict[int, Callable[[Any], None]] = _Reader.dispatch
+        return _Unpickler.byte_array if code == pickle.BYTEARRAY8[0] else taken[code]
 
     def byte_array(self) -> None:
         """Take a step that makes an array of bytes, whose room is made when they are there."""
@@ -181,7 +173,9 @@ class _Unpickler(_Reader):
         full = f"{module}.{name}"
         if full in _ADMITTED:
             return _ADMITTED[full]
-        if self._is_stand_in(module, full):
+        parents = module.split(".")
+        packages = {".".join(parents[: i + 1]) + ".*" for i in range(len(parents))}
+        if full in self._stand_ins or not packages.isdisjoint(self._stand_ins):
             if full not in self._classes:
                 self._classes[full] = type("StandIn", (StandIn,), {"origin": full})
             return self._classes[full]
@@ -196,33 +190,6 @@ class _Unpickler(_Reader):
         raise UnsafePickle(
             "this pickle refers to objects outside itself", where=self._path, field="persistent id"
         )
-
-    def _is_stand_in(self, module: str, full: str) -> bool:
-        parents = module.split(".")
-        packages = {".".join(parents[: i + 1]) + ".*" for i in range(len(parents))}
-        return full in self._stand_ins or not packages.isdisjoint(self._stand_ins)
-
-
-_CHECKED = ("BUILD", "SETITEM", "SETITEMS", "DICT")
-
-
-def _dispatch() -> dict[int, Callable[[Any], None]]:
-    """What takes each step."""
-    taken = {getattr(pickle, name)[0] for name in _STEPS.split()}
-    steps = {code: step for code, step in _Reader.dispatch.items() if code in taken}
-    for name in ("INT", "LONG", "LONG1", "LONG4"):
-        code = getattr(pickle, name)[0]
-        steps[code] = lambda reader, load=steps[code]: reader.integer(load)
-    build, one, many, table = (steps[getattr(pickle, name)[0]] for name in _CHECKED)
-    steps[pickle.BUILD[0]] = lambda reader: reader.state(build)
-    steps[pickle.SETITEM[0]] = lambda reader: reader.entries(one, reader.stack[-2:-1])
-    steps[pickle.SETITEMS[0]] = lambda reader: reader.entries(many, reader.stack[::2])
-    steps[pickle.DICT[0]] = lambda reader: reader.entries(table, reader.stack[::2])
-    steps[pickle.BYTEARRAY8[0]] = _Unpickler.byte_array
-    return steps
-
-
-_DISPATCH = _dispatch()
 
 
 # What has parts.
