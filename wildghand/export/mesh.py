@@ -425,10 +425,9 @@ def _add_motion(
 
 
 def strongest(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Keep the four largest weights of each vertex, of (V, 16) whose rows sum to 1.
+    """The four largest weights of each vertex, of (V, 16) whose rows sum to 1.
 
-    Returns:
-        (V, 4) uint8 joints and (V, 4) float32 weights that sum to 1; 0 stands at joint 0.
+    (V, 4) uint8 joints and (V, 4) float32 weights that sum to 1; 0 stands at joint 0.
     """
     order = np.argsort(-weights, axis=1, kind="stable")[:, :_JOINTS]
     kept = np.take_along_axis(weights, order, axis=1).astype(np.float64)

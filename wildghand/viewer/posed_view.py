@@ -159,13 +159,7 @@ class Picture:
 
 
 class Player:
-    """Goes from frame to frame; where drawing is slower, frames are left out.
-
-    Args:
-        count: frames, which are played round and round.
-        fps: frames per second at speed 1.
-        show: takes the frame that is due.
-    """
+    """Goes round and round from frame to frame; where showing is slower, frames are left out."""
 
     def __init__(self, count: int, fps: float, show: Callable[[int], None]) -> None:
         self._count, self._fps, self._show = count, fps, show

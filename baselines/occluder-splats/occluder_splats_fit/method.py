@@ -79,13 +79,9 @@ class FrameOccluders:
 
 
 def mask_boxes(masks: torch.Tensor, margin: float = 0.1) -> torch.Tensor:
-    """Bounding boxes of masks, grown by a margin and cut at the border.
+    """Bounding boxes of masks (R, H, W), grown by a margin and cut at the border.
 
-    Args:
-        masks: (R, H, W) uint8; above 127 is the hand, of which each has a pixel.
-
-    Returns:
-        (R, 4) int64 px: left, top, right, bottom; the last two are exclusive.
+    (R, 4) int64 px: left, top, right, bottom; the last two are exclusive.
     """
     height, width = masks.shape[1:]
     boxes = []
@@ -102,13 +98,7 @@ def mask_boxes(masks: torch.Tensor, margin: float = 0.1) -> torch.Tensor:
 def make_occluders(
     images: torch.Tensor, boxes: torch.Tensor, count: int, opacity: float, device: torch.device
 ) -> FrameOccluders:
-    """Spread faint occluders evenly over a box in each frame, in the colours of that frame.
-
-    Args:
-        images: (R, H, W, 3) uint8 sRGB.
-        boxes: (R, 4) from `mask_boxes`.
-        opacity: of each, in (0, 1).
-    """
+    """Spread faint occluders evenly over the box of each frame (R, H, W, 3), in its colours."""
     square = torch.as_tensor((0.5 + np.arange(count)[:, None] * _R2_STEP) % 1.0)
     sizes = (boxes[:, 2:] - boxes[:, :2])[:, None].double()
     places = (boxes[:, None, :2] + square * sizes).float()

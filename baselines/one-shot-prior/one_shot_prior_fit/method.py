@@ -52,20 +52,10 @@ class BiasedTexture(CompactTexture):
 
 
 class OneShotModel:
-    """A hand of the prior, and the few tensors that make it a person's.
+    """A hand of the prior, of which only what `parameters` names may change.
 
-    Args:
-        training: the capture.
-        gaussians: on each hand.
-        mean_color: (3,) sRGB of the hand, which the network's colours start from.
-        frame_count: training frames.
-        seed: of the places of the Gaussians.
-        device: where it lives.
-
-    Attributes:
-        model: the network's hands; only what `parameters` names may change.
-        gain: (3,) on the colours of all Gaussians.
-        offset: (3,) added to them.
+    The network's colours start from `mean_color`; gain and offset, (3,) each, act on those of all
+    Gaussians.
     """
 
     def __init__(

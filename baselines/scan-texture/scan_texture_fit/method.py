@@ -75,12 +75,9 @@ class ScanSettings(LoopSettings):
 
 
 class ShadowNet(nn.Module):
-    """Three convolutions over the texture plane; one sigmoid channel.
+    """Three convolutions over the texture plane of some cells' edge; one sigmoid channel.
 
-    Args:
-        uv: (N, 2) the anchors' texture coordinates, in [0, 1].
-        channels: of what is known of each anchor in a frame.
-        cells: along an edge of the plane.
+    It sees some channels of what is known of each anchor in a frame.
     """
 
     coordinates: Tensor
@@ -156,12 +153,7 @@ class ScanDrawing(Drawing):
 
 
 class ScanHand(nn.Module):
-    """One hand: what is fitted of it, and how an anchor is displaced and coloured.
-
-    Args:
-        uv: (N, 2) texture coordinates of the anchors.
-        color: (3,) sRGB of the skin at the start.
-    """
+    """One hand: what is fitted of it, and how an anchor is displaced and coloured."""
 
     def __init__(self, rig: HandRig, uv: Tensor, color: Tensor, settings: ScanSettings) -> None:
         super().__init__()

@@ -86,15 +86,9 @@ def visibility(
 def lamp_cameras(
     points: torch.Tensor, lamp: torch.Tensor, size: int
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Cameras towards points from the lamp's direction, that just hold them all.
+    """Cameras (B, 4, 4) and (B, 3, 3) towards points (B, N, 3), that just hold them all.
 
-    Args:
-        points: (B, N, 3) m, world.
-        lamp: (3,) m, world; a lamp in the centre of the points looks along z.
-        size: edge of the image, px.
-
-    Returns:
-        (B, 4, 4) world to camera, and (B, 3, 3) px.
+    They look from the lamp's direction; a lamp in the centre of the points looks along z.
     """
     center = points.mean(dim=1)
     away = lamp - center
@@ -141,23 +135,12 @@ class ShadowedModel(PlainModel):
         return replace(made, lamp=values["lamp"], logit_ambient=values["ambient"])
 
     def lit(self, colors: torch.Tensor, poses: AnchorPoses) -> torch.Tensor:
-        """Multiply the light on; differentiable in the colours and the light.
-
-        Args:
-            colors: (N, 3) or (B, N, 3) albedo, sRGB.
-
-        Returns:
-            (B, N, 3) sRGB.
-        """
+        """Multiply the light on albedos (N, 3) or (B, N, 3); differentiable in both."""
         # As in HARP the light is multiplied on in sRGB.
         return super().lit(colors, poses) * self.shading(poses)[..., None]
 
     def shading(self, poses: AnchorPoses) -> torch.Tensor:
-        """The share of the light that reaches each anchor; differentiable in lamp and ambient.
-
-        Returns:
-            (B, N) in [0, 1].
-        """
+        """(B, N) the share of the light at each anchor; differentiable in lamp and ambient."""
         towards = torch.nn.functional.normalize(self.lamp - poses.positions, dim=-1)
         facing = (quat_third_axis(poses.orientations) * towards).sum(dim=-1).relu()
         if self.shadow_size:

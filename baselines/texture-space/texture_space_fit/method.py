@@ -41,14 +41,7 @@ class SkinSpace:
     components: Tensor
 
     def at(self, uv: Tensor) -> tuple[Tensor, Tensor]:
-        """Read the space bilinearly.
-
-        Args:
-            uv: (N, 2) in [0, 1], origin at the bottom left.
-
-        Returns:
-            (N, 3) mean and (K, N, 3) components.
-        """
+        """Mean (N, 3) and components (K, N, 3) at places (N, 2), read bilinearly."""
         index, weight = bilinear_taps(uv, len(self.mean))
 
         def read(planes: Tensor) -> Tensor:
@@ -106,13 +99,7 @@ class SpaceHand:
 
 
 class SpaceModel:
-    """One or two hands of one person.
-
-    Args:
-        rigs: by side.
-        uv: (N, 2) where the anchors of each hand read the skin.
-        skins: the space.
-        color: (3,) mean linear colour of the hand, which the light starts from.
+    """One or two hands of one person; the light starts from the hand's mean linear colour.
 
     Attributes:
         latent: (K,) weights of the components, in standard deviations.

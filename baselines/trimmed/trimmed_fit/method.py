@@ -23,11 +23,7 @@ PATCH, INNER = 16, 8
 
 
 class ErrorHistogram:
-    """A histogram of errors that forgets; quantiles are read from it.
-
-    Args:
-        decay: share that stays when errors are added.
-        device: where the errors are.
+    """A histogram of errors, of which a share stays when errors are added.
 
     Source: Sabour et al., "SpotLessSplats", and its code; RobustNeRF takes the
     quantile of the last batch, which is a decay of 0.
@@ -43,11 +39,7 @@ class ErrorHistogram:
         self.counts = self.decay * self.counts + torch.bincount(bins, minlength=BINS)
 
     def quantile(self, share: float) -> float:
-        """The upper edge of the bin that a share of the errors does not exceed.
-
-        Args:
-            share: in [0, 1].
-        """
+        """The upper edge of the bin that a share of the errors does not exceed."""
         total = self.counts.cumsum(0)
         if float(total[-1]) == 0.0:
             return 1.0
@@ -133,14 +125,10 @@ FEATURES = LOOK + 4 * FREQUENCIES
 
 
 def look_features(image: np.ndarray) -> np.ndarray:
-    """Describe the look of each pixel of an image.
+    """Describe the look of each pixel of an image (H, W, 3) uint8: (H, W, LOOK) float32.
 
-    Args:
-        image: (H, W, 3) uint8 sRGB.
-
-    Returns:
-        (H, W, LOOK) float32: CIELAB divided by 100; the energies of even and odd Gabor filters of
-        the lightness, by wavelength and direction.
+    CIELAB divided by 100; the energies of even and odd Gabor filters of the lightness, by
+    wavelength and direction.
     """
     lab = cv2.cvtColor(image.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB) / 100.0
     return np.concatenate((lab, oriented_energies(lab[..., 0])), axis=-1)

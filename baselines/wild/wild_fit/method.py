@@ -50,16 +50,9 @@ class Appearance:
 def start_appearance(
     places: torch.Tensor, frames: int, frame_features: int, hidden: int, seed: int
 ) -> dict[str, torch.Tensor]:
-    """The tensors before the first step.
+    """The tensors before the first step, by name: `frame` (R, E), `gaussian` (N, 24), the network.
 
-    Args:
-        places: (N, 3) where the Gaussians are on the hand at rest, in the hand's own size: most
-            coordinates lie in [0, 1].
-
-    Returns:
-        by name: `frame` (R, E), `gaussian` (N, 24), and the weights of three layers for `appear`.
-
-    Source: the code of WildGaussians.
+    Places (N, 3) are those of `places_at_rest`. Source: the code of WildGaussians.
     """
     random, device = torch.Generator().manual_seed(seed), places.device
 
@@ -119,14 +112,9 @@ def appear(
 
 
 def places_at_rest(corners: torch.Tensor, barycentric: torch.Tensor) -> torch.Tensor:
-    """Where the Gaussians of one hand are at rest, in the hand's own size.
+    """Where Gaussians in triangles (N, 3, 3) are at rest, in the hand's own size: (N, 3).
 
-    Args:
-        corners: (N, 3, 3) m, the corners of each anchor's triangle.
-        barycentric: (N, 3).
-
-    Returns:
-        (N, 3), centred at 0.5; 97 % of the coordinates of each axis lie in [0, 1].
+    They are centred at 0.5; 97 % of the coordinates of each axis lie in [0, 1].
     """
     places = (corners * barycentric[..., None]).sum(dim=1)
     places = places - places.mean(dim=0)
