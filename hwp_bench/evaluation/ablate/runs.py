@@ -107,7 +107,10 @@ def make_design(
     if crossed and (alternatives or len(components) > MAX_FACTORS):
         raise UsageError(f"at most {MAX_FACTORS} components, no alternatives, can be crossed")
     factorial = bool(crossed) or len(components) <= DEFAULT_FACTORS
-    outs = _all_subsets(components) if factorial else _one_by_one(components)
+    outs = [(), *((item,) for item in components), components]
+    if factorial:
+        counts = range(len(components) + 1)
+        outs = [subset for count in counts for subset in combinations(components, count)]
     variants = [_variant(out) for out in sorted(outs, key=len, reverse=True)]
     effects = _factorial_effects(components) if factorial else _out_effects(components)
     if factorial and len(components) > DEFAULT_FACTORS:
@@ -130,15 +133,6 @@ def _switch(manifest: MethodManifest, name: str) -> Switch:
         field="switches",
         remedy=did_you_mean(name, manifest.switches) or f"It declares: {known}.",
     )
-
-
-def _all_subsets(components: Sequence[Switch]) -> list[tuple[Switch, ...]]:
-    counts = range(len(components) + 1)
-    return [subset for count in counts for subset in combinations(components, count)]
-
-
-def _one_by_one(components: Sequence[Switch]) -> list[tuple[Switch, ...]]:
-    return [(), *((item,) for item in components), tuple(components)]
 
 
 def _variant(thrown: tuple[Switch, ...]) -> Variant:
@@ -191,6 +185,11 @@ class AblationRuns:
     design: Design
     #: The evaluations by variant, in the design's order.
     runs: Mapping[str, MethodRuns]
+
+    @property
+    def any_run(self) -> MethodRuns:
+        """One of the runs; all have the same captures and seeds."""
+        return next(iter(self.runs.values()))
 
     @property
     def results(self) -> list[Results]:
