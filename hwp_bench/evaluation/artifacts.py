@@ -60,10 +60,7 @@ def keep_artifacts(
 
 
 def keep_log(source: Path, target: Path) -> None:
-    """Copy a log, at most as much of it as the toolkit itself keeps of a method's output.
-
-    A method may have put another file in its place.
-    """
+    """Copy a log, or as much of what a method put in its place as the toolkit itself would keep."""
     with open(source, "rb") as stream:
         # What is kept of both ends, and the line between them.
         atomic_write(target, stream.read(MAX_LOG_BYTES + 1024))
@@ -134,14 +131,10 @@ def _prediction(scored: ScoredFrames, place: int) -> tuple[np.ndarray, str]:
     return pixels, f"PSNR {scored.scores[place].scores['psnr']:.2f} dB"
 
 
-def find_extreme_frames(frames: Sequence[FrameResult], metric: str = "psnr") -> dict[str, int]:
-    """Return the positions of the worst, median and best frame in a list of results."""
-    order = np.argsort([frame.scores[metric] for frame in frames], kind="stable")
-    return {
-        "worst": int(order[0]),
-        "median": int(order[len(order) // 2]),
-        "best": int(order[-1]),
-    }
+def find_extreme_frames(frames: Sequence[FrameResult]) -> dict[str, int]:
+    """Return the positions of the frames of worst, median and best PSNR in a list of results."""
+    order = np.argsort([frame.scores["psnr"] for frame in frames], kind="stable").tolist()
+    return {"worst": order[0], "median": order[len(order) // 2], "best": order[-1]}
 
 
 def free_view_picture(scored: ScoredFrames) -> np.ndarray:

@@ -6,23 +6,23 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 from hwp_bench.analysis.pairing import MethodRuns
 from hwp_bench.base.errors import UsageError, did_you_mean
 from hwp_bench.capture.splits import Split
+from hwp_bench.commitments.publication import open_captures
 from hwp_bench.evaluation.evaluate import (
     EvaluationSettings,
+    How,
     OnCapture,
     make_plan,
-    open_captures,
     run_plans,
     with_setting_files,
 )
 from hwp_bench.methods.manifest import MANIFEST, MethodManifest, Switch
 from hwp_bench.metrics.lpips import load_available
 from hwp_bench.results import Results
-from hwp_bench.run.engine import Engine, Needs
 
 #: Components that are crossed when nothing is asked for and the method names none.
 DEFAULT_FACTORS = 2
@@ -212,10 +212,7 @@ def run_ablation(
     *,
     splits: Mapping[str, Split] | None = None,
     on_job: OnCapture | None = None,
-    engine: Engine | None = None,
-    needs: Needs | None = None,
-    overwrite: bool = False,
-    rehearse: bool = False,
+    **how: Unpack[How],
 ) -> AblationRuns:
     """Run an ablation; what is on disk from an earlier start is taken as it is, and said.
 
@@ -245,17 +242,7 @@ def run_ablation(
         for number in range(len(opened))
         for variant in _rotated(design.variants, number + seed)
     ]
-    results = run_plans(
-        out,
-        plans,
-        order,
-        on_start=on_job,
-        engine=engine,
-        needs=needs,
-        overwrite=overwrite,
-        rehearse=rehearse,
-        tables=False,
-    )
+    results = run_plans(out, plans, order, on_start=on_job, tables=False, **how)
     runs = {}
     for variant in design.variants:
         by_seed = {seed: results[result_folder(variant.name, seed)] for seed in seeds}

@@ -38,42 +38,20 @@ MAX_FOLDERS = 20_000
 MODES = ("auto", "required", "none")
 #: Environment variables that a method's process inherits in any case.
 INHERITED = (
-    "CUDA_VISIBLE_DEVICES",
-    "LANG",
-    "LC_ALL",
-    "LD_LIBRARY_PATH",
-    "NUMBA_NUM_THREADS",
+    *("CUDA_VISIBLE_DEVICES", "LANG", "LC_ALL", "LD_LIBRARY_PATH", "PATH", "PYTHONPATH"),
+    *("VIRTUAL_ENV", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "GOTO_NUM_THREADS"),
     *OPENMP_WAITING,
     *OPENCV_WAITING,
     *TORCH_COUNTS,
-    "OPENBLAS_NUM_THREADS",
-    "GOTO_NUM_THREADS",
-    "PATH",
-    "PYTHONPATH",
-    "VIRTUAL_ENV",
 )
 #: Variables that name folders, which exist only where it runs without a sandbox.
-INHERITED_FOLDERS = (
-    "HOME",
-    "TMPDIR",
-    "TORCH_HOME",
-    "XDG_CACHE_HOME",
-)
+INHERITED_FOLDERS = ("HOME", "TMPDIR", "TORCH_HOME", "XDG_CACHE_HOME")
 # Programs and libraries. /usr/local and CUDA's usual places are inside.
 _SYSTEM = ("usr", "bin", "sbin", "lib", "lib32", "lib64", "libx32", "opt", "nix/store", "gnu/store")
 # Of /etc only what programs look up; not, for example, /etc/shadow.
 _ETC = (
-    "OpenCL",
-    "alternatives",
-    "fonts",
-    "group",
-    "hosts",
-    "ld.so.cache",
-    "ld.so.conf",
-    "ld.so.conf.d",
-    "localtime",
-    "nsswitch.conf",
-    "passwd",
+    *("OpenCL", "alternatives", "fonts", "group", "hosts", "ld.so.cache", "ld.so.conf"),
+    *("ld.so.conf.d", "localtime", "nsswitch.conf", "passwd"),
 )
 # Of /sys what tells processors, memory and accelerators; not firmware, nor the kernel's tracing.
 _SYS = ("bus", "class", "dev", "devices", "fs/cgroup", "kernel/mm", "module")
@@ -157,11 +135,11 @@ def sandbox_environment(
     shown = {os.path.realpath(path) for path in confinement.exposed}
     foreign = [path for path in foreign_folders(method.resolve()) if path not in shown]
     kernels = _kernels()
-    writable = [output, kernels] if KEPT_KERNELS in environment else [output]
+    cache = [] if os.path.realpath(cache_root()) in shown else [cache_root().absolute()]
     places = visible_places(
         read=[method, request, weights, kernels, *_libraries(), *confinement.exposed],
-        write=writable,
-        hidden=[*map(Path, foreign), *_unless(shown, cache_root()), *confinement.hidden],
+        write=[output, kernels] if KEPT_KERNELS in environment else [output],
+        hidden=[*map(Path, foreign), *cache, *confinement.hidden],
         scratch=scratch_bytes(confinement.memory_bytes),
     )
     return environment, places
@@ -198,10 +176,6 @@ def _of_the_kernel(path: str) -> bool:
 
 def _taken(names: Sequence[str]) -> dict[str, str]:
     return {name: os.environ[name] for name in names if name in os.environ}
-
-
-def _unless(shown: set[str], folder: Path) -> list[Path]:
-    return [] if os.path.realpath(folder) in shown else [folder.absolute()]
 
 
 def _libraries() -> list[Path]:
@@ -312,13 +286,9 @@ def _resolved(path: str) -> tuple[list[tuple[str, str]], str]:
 
 def python_places() -> list[str]:
     """Return the folders of this interpreter, its packages and the toolkit."""
-    sites = _sites()
+    sites = [*site.getsitepackages(), site.getusersitepackages()]
     linked = [path for folder in _linked(sites) for path in package_paths(folder)]
     return [sys.prefix, sys.base_prefix, *package_paths(os.fspath(PACKAGES)), *sites, *linked]
-
-
-def _sites() -> list[str]:
-    return [*site.getsitepackages(), site.getusersitepackages()]
 
 
 def package_paths(folder: str) -> list[str]:
@@ -363,12 +333,8 @@ def hidden_packages(folders: Iterable[str]) -> list[str]:
     """
     found = []
     for folder in folders:
-        above = [
-            folder,
-            os.path.dirname(folder),
-            *glob(f"{escape(folder)}/lib*/python*/*-packages"),
-        ]
-        for place in above:
+        inside = glob(f"{escape(folder)}/lib*/python*/*-packages")
+        for place in (folder, os.path.dirname(folder), *inside):
             package = os.path.join(place, "hwp_bench")
             # A name alone would hide somebody else's folder of that name.
             if os.path.isfile(os.path.join(package, "__init__.py")):

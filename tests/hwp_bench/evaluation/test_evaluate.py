@@ -16,7 +16,7 @@ from hwp_bench.capture import Capture
 from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.evaluation.evaluate import EvaluationSettings, default_folder, evaluate
 from hwp_bench.methods.contract import Budget, RunSettings
-from hwp_bench.metrics import METRICS, PROTOCOLS, metric, penalty
+from hwp_bench.metrics import METRICS, metric, penalty
 from hwp_bench.results import Results, read_results
 from hwp_bench.run.sandbox.confinement import Confinement
 
@@ -149,7 +149,7 @@ def test_a_frame_that_cannot_be_scored_is_named_and_penalised(
     results = run(entry, captures, tmp_path / "out")
     bad, good = results.captures[0].frames
     assert problem in bad.failure
-    assert bad.scores == {name: penalty(PROTOCOLS)[name] for name in bad.scores}
+    assert bad.scores == {name: penalty()[name] for name in bad.scores}
     assert good.failure is None
     assert good.scores["psnr"] == metric("psnr").perfect
     assert results.captures[0].failed_frames == 1

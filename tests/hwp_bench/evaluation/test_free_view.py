@@ -24,7 +24,7 @@ from hwp_bench.evaluation.evaluate import EvaluationSettings, evaluate
 from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.manifest import read_manifest
 from hwp_bench.methods.request import open_request, write_request
-from hwp_bench.metrics import PROTOCOLS, metric, penalty
+from hwp_bench.metrics import metric, penalty
 from hwp_bench.results import CaptureResult, read_results
 from hwp_bench.run.sandbox.confinement import Confinement
 
@@ -107,7 +107,7 @@ def test_the_truth_scores_perfectly_and_a_missing_frame_costs_its_penalty(
     for row in free.frames:
         if row.frame == 2:
             assert "does not exist" in (row.failure or "")
-            assert row.scores == penalty(PROTOCOLS, {})
+            assert row.scores == penalty()
             continue
         assert row.failure is None
         for name, value in row.scores.items():
@@ -170,14 +170,14 @@ def test_a_frame_that_fails_costs_itself_and_no_more(
     free = result.free_view
     assert free is not None
     assert [row.failure is None for row in free.frames] == [True] * 3 + [False] * 2
-    assert free.frames[4].scores == penalty(PROTOCOLS, {})
+    assert free.frames[4].scores == penalty()
 
 
 def test_a_method_that_crashes_gets_every_penalty(capture: Capture, tmp_path: Path) -> None:
     crashing = method(tmp_path / "m", fit="raise RuntimeError('no luck')")
     free = run(crashing, capture, tmp_path / "out").free_view
     assert free is not None
-    assert all(row.scores == penalty(PROTOCOLS, {}) for row in free.frames)
+    assert all(row.scores == penalty() for row in free.frames)
 
 
 def test_a_request_has_hands_and_cameras_but_no_picture(capture: Capture, tmp_path: Path) -> None:

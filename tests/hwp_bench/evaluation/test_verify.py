@@ -20,7 +20,7 @@ from hwp_bench.base.images import write_image
 from hwp_bench.capture import Capture
 from hwp_bench.cli.main import main
 from hwp_bench.evaluation.verify import CROSS_SAMPLE, reference_scores, sample_frames
-from hwp_bench.metrics import HWP_V1, score
+from hwp_bench.metrics import score
 from hwp_bench.metrics.score import score_frame
 from hwp_bench.results import read_results, write_results
 
@@ -237,7 +237,7 @@ def test_both_agree_wherever_the_hand_is(seed: int, height: int, width: int, exa
     mask[top : top + rng.integers(3, 30), left : left + rng.integers(3, 30)] = 255
     mask[rng.random(mask.shape) < 0.02] = 127 if exact else 0
     mask[top : top + 3, left : left + 3] = 255
-    expected = score_frame(prediction, target, mask, (HWP_V1,), coverage=exact)
+    expected = score_frame(prediction, target, mask, coverage=exact)
     found = reference_scores(prediction, target, mask, coverage=exact)
     assert found == pytest.approx({name: expected[name] for name in found}, abs=1e-9)
 

@@ -10,11 +10,16 @@ import pytest
 
 from hwp_bench.base.errors import BadInput, BadMethod
 from hwp_bench.methods.contents import (
+    digest_of,
     exposed_digest,
     left_out_folders,
-    method_digest,
+    method_files,
     refuse_links_out,
 )
+
+
+def method_digest(root: Path) -> str:
+    return digest_of(method_files(root))
 
 
 def make_method(root: Path) -> Path:

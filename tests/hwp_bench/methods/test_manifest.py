@@ -12,7 +12,7 @@ import pytest
 
 from hwp_bench.base.errors import BadMethod, HwpError, UsageError
 from hwp_bench.evaluation.evaluate import EvaluationSettings, with_setting_files
-from hwp_bench.methods.contents import method_digest
+from hwp_bench.methods.contents import digest_of, method_files
 from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.manifest import (
     MethodManifest,
@@ -174,7 +174,7 @@ def test_a_name_leads_to_no_other_folder(
 def test_the_digest_is_that_of_the_files(tmp_path: Path) -> None:
     first = read_manifest(_write(tmp_path, GOOD)).digest
     (tmp_path / "code.py").write_text("x = 1")
-    assert read_manifest(tmp_path).digest == method_digest(tmp_path) != first
+    assert read_manifest(tmp_path).digest == digest_of(method_files(tmp_path)) != first
 
 
 SWITCHES = """

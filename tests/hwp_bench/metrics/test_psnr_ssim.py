@@ -137,7 +137,7 @@ RELEASED = {"data_range": 2.0, "channel_axis": 2}
 
 def score(x: np.ndarray, y: np.ndarray, mask: np.ndarray) -> dict[str, float]:
     """Scores of two images of 8-bit values in [0, 1] on the pixels of `mask`, without erosion."""
-    return score_frame(as_uint8(x), as_uint8(y), mask, (HWP_V1,), coverage=True)
+    return score_frame(as_uint8(x), as_uint8(y), mask, coverage=True)
 
 
 @pytest.fixture
