@@ -99,7 +99,6 @@ class Publication:
     sealed: Path
     #: Digest of all commitments (hex), as the public manifest holds it.
     commitment: str
-    #: Ids of the captures.
     captures: tuple[str, ...]
 
 

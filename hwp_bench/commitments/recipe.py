@@ -107,9 +107,7 @@ class Recipe:
 
     #: Its scenes, each once.
     scenes: Annotated[tuple[RecipeScene, ...], Meta(min_length=1, max_length=MAX_CAPTURES)]
-    #: Edge of the images, px.
     size: Annotated[int, Meta(ge=16, le=4096)]
-    #: Version of the renderer.
     renderer: Annotated[int, Meta(ge=1, le=10**6)] = RENDERER
 
     def __post_init__(self) -> None:

@@ -59,7 +59,6 @@ SUITE = "suite.json"
 class SuitePage:
     """The page that is published before anybody submits: the recipe, and two commitments."""
 
-    #: Everything but the secret.
     recipe: Recipe
     #: Binds the secret and the recipe (`secret.secret_commitment`).
     secret_commitment: Digest
@@ -90,7 +89,6 @@ def read_suite_page(public: str | os.PathLike[str]) -> SuitePage:
 class SealedSuite:
     """A sealed suite that was made."""
 
-    #: Part for authors.
     public: Path
     #: Part that scores submissions; stays with the organiser.
     sealed: Path
@@ -196,7 +194,6 @@ def read_revealed(path: str | os.PathLike[str]) -> Revealed:
 class CheckedCapture:
     """One capture that was made again."""
 
-    #: Its id.
     id: str
     #: Whether test frames, masks and split are those that the manifest is committed to.
     hidden: bool
@@ -215,7 +212,6 @@ class CheckedCapture:
 class Checked:
     """Captures that were made again and compared; the secret itself fits its commitment."""
 
-    #: The page of the suite.
     page: SuitePage
     #: Captures that were made again, in the recipe's order.
     captures: tuple[CheckedCapture, ...]

@@ -57,11 +57,8 @@ _FACTS = (
 class CaptureEvaluation:
     """One method on one capture."""
 
-    #: The method.
     manifest: MethodManifest
-    #: The capture.
     capture: Capture
-    #: Its split.
     split: Split
     #: Settings, seed, budget and training frames.
     run: RunSettings

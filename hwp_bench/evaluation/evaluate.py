@@ -200,7 +200,6 @@ def with_setting_files(
 class Plan:
     """A method with its settings on every capture; `evaluate_capture` runs one of them."""
 
-    #: The method.
     manifest: MethodManifest
     #: How it is evaluated: the preset that is taken, and all settings of the method.
     settings: EvaluationSettings

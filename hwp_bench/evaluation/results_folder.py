@@ -54,7 +54,6 @@ _SHOWN = 40
 class ResultsFolder:
     """The folder of one evaluation, and what is in it already."""
 
-    #: The folder.
     root: Path
     #: The evaluations, one a capture.
     evaluations: tuple[CaptureEvaluation, ...]

@@ -41,7 +41,6 @@ EXCHANGE_FRAMES = 0.75
 class Target:
     """The truth of one frame."""
 
-    #: Index in the capture.
     frame: int
     #: (H, W, 3) uint8 sRGB.
     pixels: np.ndarray
@@ -65,7 +64,6 @@ class Target:
 class Prediction:
     """One predicted frame, or the reason why it cannot be scored."""
 
-    #: Frame index in the capture.
     frame: int
     #: (H, W, 3) uint8 sRGB, or None.
     pixels: np.ndarray | None
@@ -77,7 +75,6 @@ class Prediction:
 class ScoredFrames:
     """Predictions of some frames of a capture, or of its free-view clip, with their scores."""
 
-    #: The truth.
     targets: Sequence[Target]
     #: One for each target, in the same order, as the scores.
     predictions: Sequence[Prediction]

@@ -77,7 +77,6 @@ class Discrepancy:
 class Verification:
     """The outcome of the verification of one result."""
 
-    #: The result file.
     file: str
     #: Captures and frames whose scores were recomputed.
     captures: int
@@ -480,8 +479,8 @@ def _notes(results: Results, networks: Mapping[str, Network]) -> list[str]:
             "It does not say that each run began with new caches: code that another method left "
             "may have run in it. Only a new run can tell."
         )
-    theirs, ours = (one.get("packages") for one in (results.environment, mine))
-    theirs = theirs if isinstance(theirs, dict) else {}
+    recorded, ours = results.environment.get("packages"), mine["packages"]
+    theirs = recorded if isinstance(recorded, dict) else {}
     other = [
         f"{package} {theirs.get(package, 'absent')} (here {ours.get(package, 'absent')})"
         for package in sorted(theirs.keys() | ours.keys())

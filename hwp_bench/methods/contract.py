@@ -162,7 +162,6 @@ class FreeViews:
 
     #: Parameters of every frame, by side: true angles, with the betas of the capture.
     hands: Mapping[str, HandParameters]
-    #: The cameras of every frame.
     cameras: Cameras
 
     def __len__(self) -> int:
@@ -191,7 +190,6 @@ class RequestRecord:
     seed: Seed
     budget: Budget
     frames: Line
-    #: Indices of the training frames.
     train: list[Annotated[int, Meta(ge=0)]]
     #: Frames of the free-view clip; 0 where the capture has none.
     free_view: Annotated[int, Meta(ge=0, le=MAX_FRAMES)] = 0

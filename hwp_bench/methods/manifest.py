@@ -91,7 +91,6 @@ class Switch:
     name: str
     #: Name in tables; its short name where the file does not say.
     title: Line = ""
-    #: One sentence.
     description: Line = ""
     #: Settings that override the preset in its variant: those that take a component out, or those
     #: that put an alternative in the place of what the method does otherwise.
@@ -128,11 +127,9 @@ class ManifestFields:
 
     #: Short name: letters, digits, `.`, `_`, `-`.
     name: _MethodName
-    #: How it is entered.
     entry: Entry
     #: Name in tables; the short name where the file does not say.
     title: Line = ""
-    #: One sentence about the method.
     description: Line = ""
     #: Who made it, its terms of use, its page.
     authors: Line = ""
@@ -159,7 +156,6 @@ class ManifestFields:
 class MethodManifest(ManifestFields):
     """A checked `method.toml`; all its `settings` are names."""
 
-    #: The method directory.
     root: Path
 
     @property

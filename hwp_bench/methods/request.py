@@ -140,7 +140,6 @@ def open_request(path: str | os.PathLike[str]) -> TrainingCapture:
 class TrainingInputs:
     """Where the training part of a request comes from."""
 
-    #: Indices of the training frames.
     train: np.ndarray
     #: Kind of image that is given as frames, a key of `IMAGE_FOLDERS`.
     frames: str

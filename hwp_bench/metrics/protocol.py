@@ -57,7 +57,6 @@ class Protocol:
     smallest_lpips_box: int
     #: Largest PSNR, dB: the score of identical images.
     psnr_cap: float
-    #: The structural similarity.
     ssim: SsimSettings
 
     def as_dict(self) -> dict[str, Any]:
@@ -99,7 +98,6 @@ class Metric:
 
     #: Key in results; unique over all protocols.
     name: str
-    #: Heading in tables.
     label: str
     #: Name of the protocol that defines it.
     protocol: str
@@ -113,9 +111,7 @@ class Metric:
     penalty: float
     #: Digits after the decimal point that tables print.
     digits: int
-    #: Where the formula comes from.
     reference: str
-    #: What it measures, in one line.
     description: str
     #: The LPIPS backbone whose weights the user must have; None for weight-free metrics.
     weights: str | None = None

@@ -289,7 +289,6 @@ class Summary:
 class Aggregate:
     """The summaries that tables are made of."""
 
-    #: Over all captures.
     overall: Summary
     #: Over the captures of one hand; None if there are none.
     single: Summary | None = None

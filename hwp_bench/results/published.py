@@ -26,7 +26,6 @@ NOTE = (
 class Measurement:
     """Published scores of one method in one scope."""
 
-    #: Name of the method.
     method: str
     #: A variant of the method, or a level of the perturbation; empty if neither.
     detail: str
@@ -45,11 +44,9 @@ class PublishedTable:
 
     #: Its number in the paper, in Arabic digits.
     number: int
-    #: Its label in the paper's source.
     label: str
     #: Its page in the paper, where known; the source file does not tell.
     page: int | None
-    #: Its caption.
     caption: str
     #: Its numbers, row by row, from left to right.
     measurements: list[Measurement]
@@ -59,7 +56,6 @@ class PublishedTable:
 class Dataset:
     """One row of the paper's comparison of data sets."""
 
-    #: Name of the data set.
     name: str
     #: `Lab` or `Wild`.
     environment: str
@@ -71,11 +67,9 @@ class Dataset:
 class Published:
     """All published numbers."""
 
-    #: Title of the paper.
     title: str
     #: Where it says its code and data are.
     url: str
-    #: Tables of measurements.
     tables: list[PublishedTable]
     #: The comparison of data sets (table 1).
     datasets: list[Dataset]

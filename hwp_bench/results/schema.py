@@ -64,7 +64,6 @@ PACKAGES = (
 class FrameResult:
     """The scores of one test frame."""
 
-    #: Index in the capture.
     frame: Annotated[int, Meta(ge=0, lt=MAX_FRAMES)]
     #: Score by metric; a failed frame has the declared penalties.
     scores: ScoreTable
@@ -96,7 +95,6 @@ class CurvePoint:
 class FreeViewResult:
     """The scores of the free-view clip of a capture, apart from those of its test frames."""
 
-    #: Digest of the clip.
     digest: Line
     #: Every frame of the clip, in order.
     frames: Annotated[list[FrameResult], Meta(max_length=MAX_FRAMES)]
@@ -108,15 +106,12 @@ class FreeViewResult:
 class CaptureResult:
     """One method on one capture."""
 
-    #: Id of the capture.
     id: Line
-    #: Digest of the capture.
     digest: Line
     #: `right`, `left` or `both`.
     hands: str = field(metadata={"choices": ("right", "left", "both")})
     #: Names of the perturbations that it declares.
     perturbations: Annotated[list[Line], Meta(max_length=20)]
-    #: Digest of the split.
     split_digest: Line
     #: True where the scoring masks are exact coverage, False where they are estimates.
     exact_masks: bool
@@ -196,7 +191,6 @@ class MethodId:
 class Results:
     """One evaluation: a method on a set of captures."""
 
-    #: The method.
     method: MethodId
     #: Name of the suite, or `captures` when captures were named one by one.
     suite: Line
@@ -213,9 +207,7 @@ class Results:
     environment: FreeTable
     #: When the evaluation started, ISO 8601, UTC.
     started: Line
-    #: One entry a capture.
     captures: Annotated[list[CaptureResult], Meta(max_length=MAX_CAPTURES)]
-    #: Version of the toolkit.
     toolkit: Line
 
     def __post_init__(self) -> None:

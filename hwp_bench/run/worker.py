@@ -313,7 +313,6 @@ class RunFacts:
     steps: Count | None = None
     #: Peak memory of the process, bytes.
     peak_memory: Count | None = None
-    #: Device that the method ran on.
     device: Line | None = None
     #: Validation frames that were rendered for every checkpoint.
     checkpoint_frames: Annotated[list[Count], Meta(max_length=MAX_FRAMES)] = field(

@@ -46,7 +46,6 @@ class ScoreEffect(Contrast):
     the sum of what each adds without the other.
     """
 
-    #: Title of the effect.
     effect: str
     #: Its kind, see `AblationEffect`.
     kind: str
@@ -56,7 +55,6 @@ class ScoreEffect(Contrast):
 class CostEffect:
     """The cost of a component."""
 
-    #: Title of the effect.
     effect: str
     #: `step` (seconds per optimizer step), `fit` (seconds of the whole fit) or `render`
     #: (seconds per rendered frame).
@@ -69,7 +67,6 @@ class CostEffect:
     percent: float
     #: Lower end of its 95 % interval.
     low: float | None
-    #: Upper end.
     high: float | None
     #: Captures that it rests on.
     captures: int

@@ -70,7 +70,6 @@ class Design:
     alternatives: tuple[Switch, ...]
     #: Variants, the barest first, the full method last before the alternatives.
     variants: tuple[Variant, ...]
-    #: Effects.
     effects: tuple[AblationEffect, ...]
 
 
@@ -181,7 +180,6 @@ def _out_effects(components: Sequence[Switch]) -> list[AblationEffect]:
 class AblationRuns:
     """Every evaluation of an ablation."""
 
-    #: The variants that were run.
     design: Design
     #: The evaluations by variant, in the design's order.
     runs: Mapping[str, MethodRuns]

@@ -42,11 +42,9 @@ _EDGE, _MARGIN = 176, 4
 class BudgetRuns:
     """The evaluations of an error budget."""
 
-    #: The captures, in order.
     captures: tuple[Capture, ...]
     #: Results by what the truth replaced: `GIVEN`, names in `ORACLE_INPUTS`, `ALL`.
     results: Mapping[str, Results]
-    #: Their folders by the same names.
     folders: Mapping[str, Path]
 
 
@@ -82,8 +80,10 @@ def run_budget(
             replace(settings, run=replace(settings.run, frames=frame_choice(replaced))),
             splits=splits,
             on_capture=on_run(index, len(variants), name) if on_run else None,
-            **{**how, "rehearse": how.get("rehearse", False) and index == 0},
+            **how,
         )
+        # The method is made once, before the first capture of the first run.
+        how["rehearse"] = False
     return BudgetRuns(opened, results, folders)
 
 
@@ -126,7 +126,6 @@ class BudgetRow:
     #: `truth` (before fitting), `correction` (of the rendered test frames) or `ceiling` (an avatar
     #: without an error of its own).
     kind: str
-    #: Its name.
     name: str
     #: What that means, for people.
     text: str
@@ -145,7 +144,6 @@ class BudgetRow:
 class ErrorBudget:
     """An error budget."""
 
-    #: Title of the method.
     method: str
     #: PSNR of the method as it is by capture, dB.
     psnr: Mapping[str, float]

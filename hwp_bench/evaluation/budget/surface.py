@@ -251,7 +251,6 @@ def at_given_poses(
 class Ceiling:
     """The score of an avatar without an error of its own, on a capture that knows the truth."""
 
-    #: The capture.
     capture: Capture
     #: Rest hands of its subject, by side.
     templates: Mapping[str, HandTemplate]

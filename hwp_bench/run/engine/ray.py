@@ -335,7 +335,6 @@ def connected(address: str | None) -> Iterator[Any]:
 class Input:
     """A folder that a job reads, by content."""
 
-    #: Digest of its content.
     digest: str
     #: Where it lies on the machine that orders; None where nodes must not look there.
     path: str | None
@@ -349,11 +348,9 @@ class Order:
 
     #: Number of this order; a job that is ordered again gets a new one.
     number: int
-    #: The work.
     work: Work
     #: The folders that it reads, by name.
     inputs: Mapping[str, Input]
-    #: Environment variables of the job.
     environment: Mapping[str, str]
     #: Digest of the toolkit that ordered it.
     toolkit: str
@@ -363,7 +360,6 @@ class Order:
 class Reply:
     """The answer of a node: a result, or the names of missing inputs, or an error."""
 
-    #: The result folder.
     result: Parcel | None = None
     #: Names of inputs that must be sent.
     missing: tuple[str, ...] = ()
@@ -476,7 +472,6 @@ class Parcel:
 
     #: Digest of its content, as `folder_digest` says it.
     digest: str
-    #: The bytes.
     data: bytes
 
 

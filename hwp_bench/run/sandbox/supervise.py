@@ -458,7 +458,6 @@ def _memory_files(processes: Iterable[int]) -> int:
 class ControlGroup:
     """A group of processes whose memory the kernel limits; it also counts what no process holds."""
 
-    #: Its folder.
     folder: Path
 
     def kills(self) -> int:

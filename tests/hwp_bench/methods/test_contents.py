@@ -35,20 +35,8 @@ def test_every_file_of_a_method_counts_whatever_it_ends_with(tmp_path: Path) -> 
     assert {method_digest(make_method(tmp_path / "elsewhere"))} == seen
     # The kinds of the audit, one without an ending, a hidden file and one in a hidden folder.
     endings = [
-        "sh",
-        "so",
-        "txt",
-        "csv",
-        "h5",
-        "tflite",
-        "ply",
-        "spz",
-        "msgpack",
-        "cfg",
-        "cpp",
-        "cu",
-        "html",
-        "png",
+        *("sh", "so", "txt", "csv", "h5", "tflite", "ply"),
+        *("spz", "msgpack", "cfg", "cpp", "cu", "html", "png"),
     ]
     names = [*(f"part.{ending}" for ending in endings), "run", ".env", ".conf/a", "deep/er/b"]
     for name in names:

@@ -12,7 +12,6 @@ import pytest
 
 from hwp_bench.base.errors import BadMethod, HwpError, UsageError
 from hwp_bench.evaluation.evaluate import EvaluationSettings, with_setting_files
-from hwp_bench.methods.contents import digest_of, method_files
 from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.manifest import (
     MethodManifest,
@@ -128,17 +127,6 @@ def test_a_huge_manifest_and_paths_out_of_the_folder_are_refused(tmp_path: Path)
         read_manifest(_write(tmp_path, text))
 
 
-def test_no_method_directory_is_one_clear_error(tmp_path: Path) -> None:
-    with pytest.raises(BadMethod, match=r"has no method\.toml"):
-        find_method(str(tmp_path))
-
-
-def test_shipped_methods_are_found_by_name_and_by_path() -> None:
-    names = {manifest.name for manifest in shipped_methods()}
-    assert "plain" in names
-    assert find_method("plain").resolve() == find_method("baselines/plain").resolve()
-
-
 @pytest.mark.parametrize("name", ["plain", "network-scratch", "wildghand"])
 def test_shipped_methods_are_found_from_any_folder(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -169,12 +157,6 @@ def test_a_name_leads_to_no_other_folder(
     monkeypatch.chdir(tmp_path)
     with pytest.raises(BadMethod, match="not a method directory"):
         find_method(name)
-
-
-def test_the_digest_is_that_of_the_files(tmp_path: Path) -> None:
-    first = read_manifest(_write(tmp_path, GOOD)).digest
-    (tmp_path / "code.py").write_text("x = 1")
-    assert read_manifest(tmp_path).digest == digest_of(method_files(tmp_path)) != first
 
 
 SWITCHES = """

@@ -125,7 +125,9 @@ def test_float_images_score_as_the_eight_bits_that_they_become(seed):
     prediction, target, mask = random_frame(seed)
     expected = score_frame(prediction, target, mask)
     assert score_frame(prediction / 255.0, target / 255.0, mask) == expected
-    assert score_frame((prediction / 255.0).astype(np.float32), target, mask) == expected
+    # A half between two 8-bit levels is off by 2^-12 at most, an eighth of a level: nothing moves.
+    for kind in (np.float32, np.float16):
+        assert score_frame((prediction / 255.0).astype(kind), target, mask) == expected
     # A rendering that overshoots is clipped, as it is when it is written.
     bright = np.where(prediction == 255, 1.3, prediction / 255.0)
     assert score_frame(bright, target, mask) == expected
@@ -276,6 +278,11 @@ def test_what_does_not_fit_is_refused_by_name():
         score_frame(prediction, target.astype(np.int16), mask)
     with pytest.raises(BadImage, match=r"target: .*divide"):
         score_frame(prediction, target.astype(np.float64), mask)
+    for dtype in (np.int32, np.complex64, bool):
+        with pytest.raises(HwpError):
+            score_frame(prediction, target.astype(dtype), mask)
+    with pytest.raises(BadImage):
+        score_frame(prediction, np.full(target.shape, np.nan, np.float16), mask)
     small = np.zeros((10, 10, 3), np.uint8)
     with pytest.raises(ShapeMismatch, match="window"):
         score_frame(small, small, np.full((10, 10), 255, np.uint8))
@@ -398,18 +405,6 @@ def test_constant_frames_as_truth_and_entry(level: int) -> None:
     best(score_frame(image, image, mask))
 
 
-@pytest.mark.parametrize("level", [1, 51, 255])
-def test_a_black_video_against_a_constant_one(level: int) -> None:
-    black = np.zeros((32, 24, 3), np.uint8)
-    scores = score_frame(black + np.uint8(level), black, np.ones((32, 24), bool), coverage=True)
-    # Variances are 0, so that only SSIM's luminance term with C1 = 0.01^2 is left.
-    share = level / 255.0
-    assert scores["psnr"] == pytest.approx(-20.0 * np.log10(share), abs=1e-9)
-    inner = 1e-4 / (share**2 + 1e-4)
-    assert scores["ssim_full"] == pytest.approx(inner, abs=1e-9)
-    assert all(np.isfinite(value) for value in scores.values())
-
-
 def test_memory_layout_changes_no_bit() -> None:
     prediction, target = textured((40, 30), 2), textured((40, 30), 3)
     mask = np.zeros((40, 30), np.uint8)
@@ -419,22 +414,6 @@ def test_memory_layout_changes_no_bit() -> None:
     given = wide, np.asfortranarray(target), mask[::-1][::-1]
     assert not any(array.flags.c_contiguous for array in given[:2])
     assert score_frame(*given) == expected
-
-
-def test_half_precision_scores_as_the_eight_bits_that_it_rounds_to() -> None:
-    target = textured((40, 30), 4)
-    mask = np.ones((40, 30), bool)
-    # A half between two 8-bit levels is off by 2^-12 at most, an eighth of a level: nothing moves.
-    best(score_frame((target / 255.0).astype(np.float16), target, mask, coverage=True))
-
-
-def test_numbers_that_no_image_has_are_refused() -> None:
-    image, mask = textured((16, 16), 6), np.ones((16, 16), bool)
-    for dtype in (np.int32, np.complex64, bool):
-        with pytest.raises(HwpError):
-            score_frame(image, image.astype(dtype), mask)
-    with pytest.raises(BadImage):
-        score_frame(image, np.full(image.shape, np.nan, np.float16), mask)
 
 
 def capture(id_, hands, perturbations, scores):
