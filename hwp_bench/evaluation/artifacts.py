@@ -23,7 +23,7 @@ from hwp_bench.evaluation.scoring import (
     read_targets,
 )
 from hwp_bench.report.sources import ResultsSource
-from hwp_bench.results import CaptureResult, FrameResult
+from hwp_bench.results import FrameResult
 from hwp_bench.run.sandbox.supervise import MAX_LOG_BYTES
 from hwp_bench.run.worker import DIAGNOSTICS, LOG
 
@@ -163,7 +163,9 @@ def write_side_by_side(
     for capture in captures:
         name = capture.info.id
         found = [next(one for one in s.results.captures if one.id == name) for s in sources]
-        frame = _typical_frame(found)
+        scores = np.mean([[row.scores["psnr"] for row in one.frames] for one in found], axis=0)
+        order = np.argsort(scores, kind="stable")
+        frame = found[0].frames[int(order[len(order) // 2])].frame
         [target] = read_targets(capture, [frame])
         images: list[tuple[np.ndarray | None, str]] = [
             (target.pixels, f"truth: {name}, frame {frame}")
@@ -176,13 +178,6 @@ def write_side_by_side(
         box = square_around(target.region)
         tiles += [labelled(fitted(target.masked(image)[box], EDGE), text) for image, text in images]
     return write_image(path, sheet(tiles, columns=1 + len(sources)))
-
-
-def _typical_frame(found: Sequence[CaptureResult]) -> int:
-    """The frame of the median score, in the mean over the methods."""
-    scores = np.mean([[frame.scores["psnr"] for frame in one.frames] for one in found], axis=0)
-    order = np.argsort(scores, kind="stable")
-    return found[0].frames[int(order[len(order) // 2])].frame
 
 
 def square_around(region: np.ndarray) -> tuple[slice, slice]:

@@ -224,15 +224,14 @@ def load_available() -> dict[str, Lpips]:
     return {net: load_lpips(net) for net in BACKBONE_FILES if lpips_available(net) is None}
 
 
-def _hub_checkpoints() -> Path:
-    """The folder that torch.hub keeps checkpoints in, found without importing torch."""
+def torch_home() -> Path:
+    """The folder of torch's downloaded weights, found without importing torch."""
     cache = os.environ.get("XDG_CACHE_HOME", "~/.cache")
-    home = os.environ.get("TORCH_HOME", os.path.join(cache, "torch"))
-    return Path(home).expanduser() / "hub" / "checkpoints"
+    return Path(os.environ.get("TORCH_HOME") or f"{cache}/torch").expanduser()
 
 
 def _find_backbone(net: str) -> Path:
-    candidates = [_hub_checkpoints() / name for name in BACKBONE_FILES[net]]
+    candidates = [torch_home() / "hub" / "checkpoints" / name for name in BACKBONE_FILES[net]]
     for path in candidates:
         if path.is_file():
             return path

@@ -223,23 +223,21 @@ def run_ablation(
     settings = with_setting_files(manifest, settings)
     opened = open_captures(captures, splits)
     networks = load_available()
-    plans = {
-        result_folder(variant.name, seed): make_plan(
-            replace(manifest, title=f"{manifest.title} {variant.title}".strip()),
-            opened,
-            _of_variant(settings, variant, seed),
-            networks,
-            f"{variant.name}, seed {seed}",
-        )
-        for variant in design.variants
-        for seed in seeds
-    }
-    order = [
-        (result_folder(variant.name, seed), number)
-        for seed in seeds
-        for number in range(len(opened))
-        for variant in _rotated(design.variants, number + seed)
-    ]
+    plans, order = {}, []
+    for seed in seeds:
+        for variant in design.variants:
+            chosen = {**settings.run.settings, **variant.settings}
+            plans[result_folder(variant.name, seed)] = make_plan(
+                replace(manifest, title=f"{manifest.title} {variant.title}".strip()),
+                opened,
+                replace(settings, run=replace(settings.run, settings=chosen, seed=seed)),
+                networks,
+                f"{variant.name}, seed {seed}",
+            )
+        for number in range(len(opened)):
+            start = (number + seed) % len(design.variants)
+            turned = (*design.variants[start:], *design.variants[:start])
+            order += [(result_folder(variant.name, seed), number) for variant in turned]
     results = run_plans(out, plans, order, on_start=on_job, tables=False, **how)
     runs = {}
     for variant in design.variants:
@@ -247,13 +245,3 @@ def run_ablation(
         title = plans[result_folder(variant.name, seeds[0])].manifest.title
         runs[variant.name] = MethodRuns(title, by_seed)
     return AblationRuns(design, runs)
-
-
-def _of_variant(settings: EvaluationSettings, variant: Variant, seed: int) -> EvaluationSettings:
-    overrides = {**settings.run.settings, **variant.settings}
-    return replace(settings, run=replace(settings.run, settings=overrides, seed=seed))
-
-
-def _rotated(variants: Sequence[Variant], by: int) -> list[Variant]:
-    start = by % len(variants)
-    return [*variants[start:], *variants[:start]]

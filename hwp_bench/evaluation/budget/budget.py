@@ -193,8 +193,8 @@ def make_budget(runs: BudgetRuns) -> ErrorBudget:
     if len(ceilings) == len(base):
         parts.append(("ceiling", CEILING, CEILING_TEXT, ceilings))
     rows = [
-        BudgetRow(*head, psnr=table, gain={key: table[key] - base[key] for key in table})
-        for *head, table in parts
+        BudgetRow(kind, name, text, table, {key: table[key] - base[key] for key in table})
+        for kind, name, text, table in parts
     ]
     return ErrorBudget(given.method.title, base, tuple(rows), shown)
 

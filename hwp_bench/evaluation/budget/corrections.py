@@ -111,8 +111,8 @@ def motion(pair: Pair) -> np.ndarray:
 
     def moved(ways: np.ndarray) -> np.ndarray:
         dx, dy = np.einsum("hwk,ck->chw", shapes, ways)
-        places = (way.astype(np.float32) for way in (columns + dx, rows + dy))
-        return cv2.remap(source, *places, cv2.INTER_LINEAR).astype(np.float64)
+        across, down = (way.astype(np.float32) for way in (columns + dx, rows + dy))
+        return cv2.remap(source, across, down, cv2.INTER_LINEAR).astype(np.float64)
 
     def derivative(image: np.ndarray) -> np.ndarray:
         across, down = np.gradient(image, axis=1), np.gradient(image, axis=0)

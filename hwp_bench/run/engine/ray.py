@@ -587,7 +587,11 @@ def _entries(root: Path, skip: Sequence[str]) -> Iterator[tuple[str, Path]]:
         raise BadInput("is not a folder", where=root)
     found: list[tuple[str, Path]] = []
     size = 0
-    for folder, folders, files in os.walk(root, onerror=_refuse):
+
+    def refuse(error: OSError) -> None:
+        raise BadInput(f"cannot be read ({error.strerror})", where=error.filename) from error
+
+    for folder, folders, files in os.walk(root, onerror=refuse):
         top = Path(folder) == root
         left_out = LEFT_OUT | set(skip) if top else LEFT_OUT
         folders[:] = [name for name in folders if name not in left_out]
@@ -609,7 +613,3 @@ def _entries(root: Path, skip: Sequence[str]) -> Iterator[tuple[str, Path]]:
             remedy=f"At most {MAX_ENTRIES} files of {MAX_BYTES >> 30} GiB.",
         )
     yield from sorted(found)
-
-
-def _refuse(error: OSError) -> None:
-    raise BadInput(f"cannot be read ({error.strerror})", where=error.filename) from error

@@ -18,8 +18,10 @@ from pathlib import Path
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import cache_root
 from hwp_bench.base.numerics import OPENCV_WAITING, OPENMP_WAITING, TORCH_COUNTS
-from hwp_bench.base.packages import PACKAGES, data_folder
+from hwp_bench.base.packages import PACKAGES
 from hwp_bench.methods.contents import is_foreign
+from hwp_bench.methods.manifest import ships
+from hwp_bench.metrics.lpips import torch_home
 from hwp_bench.run.sandbox.launch import Place
 from hwp_bench.run.sandbox.supervise import SCRATCH, SCRATCH_BYTES, default_limit, scratch_bytes
 
@@ -129,7 +131,7 @@ def sandbox_environment(
         "HOME": str(home.resolve()),
         **_cache_environment(method, output),
     }
-    weights = _torch_home()
+    weights = torch_home()
     if weights.is_dir():
         environment["TORCH_HOME"] = str(weights)
     shown = {os.path.realpath(path) for path in confinement.exposed}
@@ -185,12 +187,6 @@ def _libraries() -> list[Path]:
     return [Path(path) for entry in absolute for path in package_paths(entry)]
 
 
-def _torch_home() -> Path:
-    """Folder of torch's downloaded weights, which methods may read but not write."""
-    cache = os.environ.get("XDG_CACHE_HOME", "~/.cache")
-    return Path(os.environ.get("TORCH_HOME") or f"{cache}/torch").expanduser()
-
-
 def _cache_environment(method: Path, output: Path) -> dict[str, str]:
     """Variables of the caches: a new one for this run, and the machine code of the toolkit.
 
@@ -203,7 +199,7 @@ def _cache_environment(method: Path, output: Path) -> dict[str, str]:
         "NUMBA_CACHE_DIR": str(cache / "numba"),
         "HWP_KERNELS": str(_kernels()),
     }
-    if _ships(method):
+    if ships(method):
         with contextlib.suppress(OSError):
             _kernels().mkdir(mode=0o700, parents=True, exist_ok=True)
             environment[KEPT_KERNELS] = str(_kernels())
@@ -212,12 +208,6 @@ def _cache_environment(method: Path, output: Path) -> dict[str, str]:
 
 def _kernels() -> Path:
     return cache_root().absolute() / "kernels"
-
-
-def _ships(method: Path) -> bool:
-    """Whether a method is a part of this installation of the toolkit."""
-    real = method.resolve()
-    return any(map(real.is_relative_to, (data_folder("baselines"), PACKAGES / "wildghand")))
 
 
 # --- the file system
@@ -287,7 +277,11 @@ def _resolved(path: str) -> tuple[list[tuple[str, str]], str]:
 def python_places() -> list[str]:
     """Return the folders of this interpreter, its packages and the toolkit."""
     sites = [*site.getsitepackages(), site.getusersitepackages()]
-    linked = [path for folder in _linked(sites) for path in package_paths(folder)]
+    # The folders that `.pth` files add, as editable installs do.
+    files = [Path(path) for folder in sites for path in glob(f"{folder}/*.pth")]
+    lines = [line for file in files for line in file.read_text(errors="replace").splitlines()]
+    folders = [line.strip() for line in lines if os.path.isabs(line)]
+    linked = [path for one in folders if os.path.isdir(one) for path in package_paths(one)]
     return [sys.prefix, sys.base_prefix, *package_paths(os.fspath(PACKAGES)), *sites, *linked]
 
 
@@ -313,13 +307,6 @@ def toolkit_checkout() -> list[str]:
 def _is_checkout(folder: str) -> bool:
     files = ("hwp_bench/__init__.py", "pyproject.toml")
     return all(os.path.isfile(os.path.join(folder, file)) for file in files)
-
-
-def _linked(sites: Iterable[str]) -> list[str]:
-    """Return the folders that `.pth` files add, as editable installs do."""
-    files = [path for folder in sites for path in glob(f"{folder}/*.pth")]
-    lines = [line for path in files for line in Path(path).read_text(errors="replace").splitlines()]
-    return [line.strip() for line in lines if os.path.isabs(line) and os.path.isdir(line.strip())]
 
 
 # --- what stays out of sight although it lies in a folder that is shown

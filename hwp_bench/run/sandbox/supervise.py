@@ -487,7 +487,12 @@ def control_group(
         with contextlib.suppress(OSError), open("/proc/self/cgroup") as table:
             own = table.read()
     for above in _above(mounted or _CONTROL, own):
-        _remove_old(above)
+        # Those that killed runs have left; one with processes in it stays.
+        for left in above.glob(f"{_PREFIX}*"):
+            with contextlib.suppress(OSError):
+                # A new one is empty until its first process comes.
+                if time.time() - left.stat().st_mtime > _NEW_SECONDS:
+                    left.rmdir()
         group = ControlGroup(above / f"{_PREFIX}{secrets.token_hex(6)}")
         try:
             group.folder.mkdir()
@@ -503,15 +508,6 @@ def control_group(
     return None
 
 
-def _remove_old(above: Path) -> None:
-    """Remove groups that killed runs have left; one with processes in it stays."""
-    for folder in above.glob(f"{_PREFIX}*"):
-        with contextlib.suppress(OSError):
-            # A new one is empty until its first process comes.
-            if time.time() - folder.stat().st_mtime > _NEW_SECONDS:
-                folder.rmdir()
-
-
 def _above(mounted: Path, own: str) -> Iterable[Path]:
     """Folders in which a group of its own may be possible, best first.
 
@@ -522,12 +518,7 @@ def _above(mounted: Path, own: str) -> Iterable[Path]:
         if line.startswith("0::/"):
             here = mounted / line[4:]
             for folder in (here, here.parent):
-                inside = folder.is_relative_to(mounted) and ".." not in folder.parts
-                if inside and _limits_memory(folder):
-                    yield folder
-
-
-def _limits_memory(folder: Path) -> bool:
-    with contextlib.suppress(OSError):
-        return "memory" in (folder / "cgroup.subtree_control").read_text().split()
-    return False
+                if folder.is_relative_to(mounted) and ".." not in folder.parts:
+                    with contextlib.suppress(OSError):
+                        if "memory" in (folder / "cgroup.subtree_control").read_text().split():
+                            yield folder

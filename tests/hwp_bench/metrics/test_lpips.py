@@ -248,10 +248,10 @@ def test_weights_are_found_and_an_absent_file_is_a_reason(installed: tuple[Path,
 
 def test_the_cache_is_where_torch_says(hub: Path, monkeypatch: pytest.MonkeyPatch):
     """Oracle: torch.hub.get_dir()."""
-    assert lpips_weights._hub_checkpoints() == Path(torch.hub.get_dir()) / "checkpoints"
+    assert lpips_weights.torch_home() / "hub" == Path(torch.hub.get_dir())
     monkeypatch.delenv("TORCH_HOME")
     monkeypatch.setenv("XDG_CACHE_HOME", "/somewhere")
-    assert lpips_weights._hub_checkpoints() == Path(torch.hub.get_dir()) / "checkpoints"
+    assert lpips_weights.torch_home() / "hub" == Path(torch.hub.get_dir())
 
 
 def test_a_file_that_is_not_the_published_one_is_refused(installed: tuple[Path, Path]):
