@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from small_captures import CaptureMaker
+from small_methods import SUBMISSION, write_manifest
 
 from hwp_bench.base.errors import BadCapture, BadImage, BadSplit, UsageError
 from hwp_bench.base.images import write_image
@@ -30,9 +31,7 @@ def submission(folder: Path, captures: list[Capture], pixels=Capture.frame) -> P
         target = folder / "predictions" / capture.info.id
         for frame in contiguous_split(capture.info.id, len(capture)).test.tolist():
             write_image(target / f"{frame:06d}.png", pixels(capture, frame))
-    (folder / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "entry"\n[entry]\npredictions = "predictions"\n'
-    )
+    write_manifest(folder, "entry", SUBMISSION)
     return folder
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from small_captures import CaptureMaker
+from small_methods import SUBMISSION, write_manifest
 
 from hwp_bench.base.errors import BadCapture, BadInput
 from hwp_bench.base.images import read_rgb, write_image
@@ -58,9 +59,7 @@ def submission(folder: Path, capture: Capture, views: range | tuple[int, ...]) -
         write_image(target / f"{frame:06d}.png", capture.frame(frame))
     for frame in views:
         write_image(target / "free" / f"{frame:06d}.png", clip_of(capture).frame(frame))
-    (folder / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "entry"\n[entry]\npredictions = "predictions"\n'
-    )
+    write_manifest(folder, "entry", SUBMISSION)
     return folder
 
 
@@ -83,9 +82,7 @@ class Method:
         return pixels
 """
     )
-    (folder / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "grey"\n[entry]\npython = "free_method:Method"\n'
-    )
+    write_manifest(folder, "grey", 'python = "free_method:Method"')
     return folder
 
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from small_methods import write_manifest
 
 from hwp_bench.base.errors import BadMethod, HwpError, UsageError
 from hwp_bench.evaluation.evaluate import EvaluationSettings, with_setting_files
@@ -235,9 +236,7 @@ def test_presets_and_switches_must_have_listed_settings(tmp_path: Path) -> None:
 
 
 def test_a_method_without_a_list_takes_any_setting(tmp_path: Path) -> None:
-    (tmp_path / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "free"\n[entry]\npython = "a:b"\n'
-    )
+    write_manifest(tmp_path, "free", 'python = "a:b"')
     read_manifest(tmp_path).check_setting_names({"anything": {"at": "all"}})
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from denormal_probe import Probe, states
+from small_methods import write_manifest
 
 from hwp_bench.base.numerics import flushed, flushed_process, flushes, set_flush
 from hwp_bench.methods.manifest import read_manifest
@@ -99,9 +100,7 @@ def test_the_process_of_a_method_flushes(request_folder: Path, tmp_path: Path) -
     folder.mkdir()
     (folder / "probing.py").write_text(METHOD)
     (folder / "denormal_probe.py").write_text((TESTS / "denormal_probe.py").read_text())
-    (folder / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "probe"\n[entry]\npython = "probing:Method"\n'
-    )
+    write_manifest(folder, "probe", 'python = "probing:Method"')
     run_method(read_manifest(folder), "tiny", request_folder, tmp_path / "out")
     written = next((tmp_path / "out").rglob("states.json"))
     found = json.loads(written.read_text())

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from small_methods import SCRIPT, write_manifest
 
 from hwp_bench.base.errors import MethodFailed
 from hwp_bench.evaluation.scoring import read_prediction
@@ -44,9 +45,7 @@ def python_method(folder: Path, body: str = "pass") -> MethodManifest:
     """A method that paints the mean colour of the hand; `body` runs at the end of its fit."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "mean_colour.py").write_text(PYTHON.replace("BODY", body))
-    (folder / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "mean"\n[entry]\npython = "mean_colour:Method"\n'
-    )
+    write_manifest(folder, "mean", 'python = "mean_colour:Method"')
     return read_manifest(folder)
 
 
@@ -54,10 +53,7 @@ def command_method(folder: Path, script: str) -> MethodManifest:
     """A method that is a Python script outside the contract's classes."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "run.py").write_text(script)
-    (folder / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "command"\n[entry]\n'
-        'command = ["{python}", "{method}/run.py", "{request}", "{output}"]\n'
-    )
+    write_manifest(folder, "command", SCRIPT)
     return read_manifest(folder)
 
 

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from small_methods import write_manifest
 
 from hwp_bench.base import numerics as threads
 from hwp_bench.base.errors import UsageError
@@ -162,9 +163,7 @@ def test_the_process_of_a_method_finds_what_is_ours_or_was_chosen(
     folder = tmp_path / "method"
     folder.mkdir()
     (folder / "looking.py").write_text(METHOD)
-    (folder / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "look"\n[entry]\npython = "looking:Method"\n'
-    )
+    write_manifest(folder, "look", 'python = "looking:Method"')
     run_method(read_manifest(folder), "tiny", request_folder, tmp_path / "out")
     written = next((tmp_path / "out").rglob("found.json"))
     assert json.loads(written.read_text()) == expected
@@ -177,10 +176,7 @@ def test_a_method_that_is_a_command_inherits_what_is_ours(
     folder = tmp_path / "method"
     folder.mkdir()
     (folder / "look.py").write_text("import os; print(sorted(os.environ.items()))")
-    (folder / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "look"\n[entry]\n'
-        'command = ["{python}", "{method}/look.py"]\n'
-    )
+    write_manifest(folder, "look", 'command = ["{python}", "{method}/look.py"]')
     run_method(read_manifest(folder), "tiny", request_folder, tmp_path / "out")
     printed = (tmp_path / "out" / "log.txt").read_text()
     for name in ("OMP_WAIT_POLICY", *threads.OPENCV_WAITING):

@@ -85,12 +85,10 @@ def test_jobs_side_by_side_give_the_results_of_jobs_in_turn(
 ) -> None:
     from same_results import contents
 
-    names = ("one", "two")
-    captures = [make_capture(name, frames=20, size=32, perturbations={}) for name in names]
+    captures = [make_capture(name, frames=20, size=32).root for name in ("one", "two")]
     method = write_gray_method(tmp_path / "gray", seconds=0.1)
-    paths = [str(capture.root) for capture in captures]
-    base = ["ablate", str(method), "--capture", *paths, "--seeds", "1", "-o"]
+    base = ["evaluate", str(method), "--capture", *map(str, captures), "-o"]
     assert main([*base, str(tmp_path / "turn")]) == 0
     assert main([*base, str(tmp_path / "side"), "--jobs", "2"]) == 0
-    assert "[4 of 4 ended" in capsys.readouterr().err
+    assert "[2 of 2 ended" in capsys.readouterr().err
     assert contents(tmp_path / "side") == contents(tmp_path / "turn")
