@@ -38,9 +38,8 @@ class Convolution:
 
     #: Place in `features`: its weights are `features.{index}.weight` and `.bias`.
     index: int
-    #: Input and output channels.
+    #: Input and output channels, then side of the kernel, stride and padding, px.
     channels: tuple[int, int]
-    #: Side of the kernel, px.
     kernel: int
     stride: int
     padding: int
@@ -52,18 +51,11 @@ class Convolution:
 
 def _vgg_block(first: int, channels: tuple[int, int], count: int) -> tuple[Convolution, ...]:
     """`count` 3x3 convolutions; the first changes the channels, the last is compared."""
-    return tuple(
-        Convolution(
-            index=first + 2 * k,
-            channels=channels if k == 0 else (channels[1], channels[1]),
-            kernel=3,
-            stride=1,
-            padding=1,
-            pool=(2, 2) if k == 0 and first > 0 else None,
-            tap=k == count - 1,
-        )
-        for k in range(count)
-    )
+    pool = (2, 2) if first > 0 else None
+    head = Convolution(first, channels, 3, 1, 1, pool, tap=count == 1)
+    wide = (channels[1], channels[1])
+    rest = [Convolution(first + 2 * k, wide, 3, 1, 1, tap=k == count - 1) for k in range(1, count)]
+    return (head, *rest)
 
 
 #: The convolutional parts of AlexNet (one-column form) and VGG-16.

@@ -343,30 +343,22 @@ def _check(captures: Sequence[CaptureScores]) -> None:
     if not captures:
         raise BadResult("there are no captures to average", field="captures")
     seen: set[str] = set()
-    metrics: frozenset[str] | None = None
+    metrics: set[str] | None = None
     for capture in captures:
         if capture.id in seen:
             raise BadResult("is listed twice", where=capture.id, field="id")
         seen.add(capture.id)
         if not capture.frames:
-            raise BadResult(
-                "has no scored frame",
-                where=capture.id,
-                field="frames",
-                remedy="Every capture of a result must have at least one frame with a hand.",
-            )
+            remedy = "Every capture of a result must have at least one frame with a hand."
+            raise BadResult("has no scored frame", where=capture.id, field="frames", remedy=remedy)
         for frame, row in capture.frames.items():
-            names = frozenset(row)
-            metrics = names if metrics is None else metrics
-            if names != metrics or not names:
-                odd = ", ".join(sorted(names ^ metrics)) or "none at all"
-                raise BadResult(
-                    f"its metrics differ from the other frames' ({odd})",
-                    where=capture.id,
-                    field=f"frames[{frame}]",
-                )
+            place = f"frames[{frame}]"
+            metrics = set(row) if metrics is None else metrics
+            if set(row) != metrics or not row:
+                odd = ", ".join(sorted(set(row) ^ metrics)) or "none at all"
+                problem = f"its metrics differ from the other frames' ({odd})"
+                raise BadResult(problem, where=capture.id, field=place)
             for name, score in row.items():
                 if not math.isfinite(score):
-                    raise BadResult(
-                        f"the score is {score}", where=capture.id, field=f"frames[{frame}].{name}"
-                    )
+                    problem = f"the score is {score}"
+                    raise BadResult(problem, where=capture.id, field=f"{place}.{name}")
