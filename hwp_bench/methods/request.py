@@ -151,8 +151,9 @@ class TrainingInputs:
 
 def frame_choice(truths: Iterable[str]) -> str:
     """The choice of frames in which the truth replaces some estimates."""
-    asked = [name for name in ORACLE_INPUTS if name in set(truths)]
-    return _PREFIX + ",".join(asked) if asked else FRAME_CHOICES[0]
+    asked = set(truths)
+    names = ",".join(name for name in ORACLE_INPUTS if name in asked)
+    return _PREFIX + names if names else FRAME_CHOICES[0]
 
 
 def known_oracle_inputs(capture: Capture) -> tuple[str, ...]:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
-from pathlib import Path
 
 from hwp_bench.base.errors import BadResult
 from hwp_bench.base.files import read_json
@@ -82,8 +80,7 @@ class Published:
         raise BadResult(f"table {number} holds no published measurements", field="number")
 
 
-def read_published(path: str | os.PathLike[str] | None = None) -> Published:
-    """Read published numbers."""
-    file = Path(path) if path is not None else data_folder("leaderboard") / "published.json"
-    value = read_json(file)
-    return parse_record(Published, without_schema(value, SCHEMA, where=file), where=file)
+def read_published() -> Published:
+    """Read the published numbers, which come with the toolkit."""
+    file = data_folder("leaderboard") / "published.json"
+    return parse_record(Published, without_schema(read_json(file), SCHEMA, where=file), where=file)

@@ -27,7 +27,7 @@ from hwp_bench.evaluation.ablate.runs import AblationEffect, AblationRuns, resul
 from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.metrics.score import Scores, aggregate
 from hwp_bench.report.tables import HEADLINE, PAPER
-from hwp_bench.results import CaptureResult, Results
+from hwp_bench.results import CaptureResult
 from hwp_bench.results.schema import score_rows
 from hwp_bench.results.store import ABLATION, ABLATION_SCHEMA
 from hwp_bench.taxonomy import PERTURBATIONS
@@ -73,7 +73,7 @@ class CostEffect:
 
 
 def score_effects(
-    ablation: AblationRuns, metrics: Sequence[str], *, resamples: int = RESAMPLES, seed: int = 0
+    ablation: AblationRuns, metrics: Sequence[str], *, resamples: int = RESAMPLES
 ) -> list[ScoreEffect]:
     """Return every effect in every metric and scope."""
     seeds = sorted(ablation.any_run.seeds)
@@ -86,7 +86,6 @@ def score_effects(
             metric,
             seeds,
             resamples=resamples,
-            seed=seed,
         )
     ]
 
@@ -101,7 +100,7 @@ def seconds(capture: CaptureResult, quantity: str) -> float | None:
     return spent / units if spent and units else None
 
 
-def cost_effects(ablation: AblationRuns, *, seed: int = 0) -> list[CostEffect]:
+def cost_effects(ablation: AblationRuns) -> list[CostEffect]:
     """Return the cost of every component, as ratios paired by capture and seed.
 
     Captures on which a variant says nothing of its time are left out.
@@ -112,13 +111,13 @@ def cost_effects(ablation: AblationRuns, *, seed: int = 0) -> list[CostEffect]:
     crossed = any(effect.kind == "main" for effect in effects)
     for effect in effects:
         if effect.kind != "interaction" and not (crossed and effect.kind == "out"):
-            rows = [_cost_effect(ablation, effect, quantity, seed) for quantity in QUANTITIES]
+            rows = [_cost_effect(ablation, effect, quantity) for quantity in QUANTITIES]
             found += [row for row in rows if row is not None]
     return found
 
 
 def _cost_effect(
-    ablation: AblationRuns, effect: AblationEffect, quantity: str, seed: int
+    ablation: AblationRuns, effect: AblationEffect, quantity: str
 ) -> CostEffect | None:
     # Mean log seconds by capture, (S,) each. The positive coefficients add up to 1, the negative
     # ones to -1: weights of two means.
@@ -137,7 +136,7 @@ def _cost_effect(
     if not with_it:
         return None
     ratios = [(more - less)[:, None] for more, less in zip(with_it, without, strict=True)]
-    estimate = bootstrap_mean(ratios, seed=seed)
+    estimate = bootstrap_mean(ratios)
     # A ratio beyond e^50 only means that the interval has no upper end.
     low, high = (
         None if log is None or abs(log) > 50 else 100 * math.expm1(log)
@@ -311,11 +310,6 @@ def seed_table(ablation: AblationRuns, metrics: Sequence[str]) -> Table:
     )
 
 
-def total_seconds(results: Sequence[Results]) -> float:
-    """Return the seconds of all method processes of some evaluations."""
-    return sum(capture.wall_seconds for result in results for capture in result.captures)
-
-
 def ablation_record(
     ablation: AblationRuns,
     effects: Sequence[ScoreEffect],
@@ -353,7 +347,9 @@ def ablation_record(
             }
             for variant in design.variants
         ],
-        "process_seconds": total_seconds(ablation.results),
+        "process_seconds": sum(
+            capture.wall_seconds for result in ablation.results for capture in result.captures
+        ),
         "score_effects": [asdict(item) for item in effects],
         "cost_effects": [asdict(item) for item in costs],
         "tables": {name: to_object(table) for name, table in tables.items()},
