@@ -379,7 +379,7 @@ def do_inputs(args: argparse.Namespace) -> int:
     """Run `data inputs`."""
     from hwp_bench.base.files import check_places
     from hwp_bench.commitments.inputs import check_place, write_inputs
-    from hwp_bench.evaluation.evaluate import open_captures
+    from hwp_bench.commitments.publication import open_captures
     from hwp_bench.sim import ensure_suite
 
     # Before a suite is rendered.
