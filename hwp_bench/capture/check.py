@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from hwp_bench.base.arrays import evenly
@@ -29,6 +28,7 @@ from hwp_bench.capture.schema import (
     image_path,
 )
 from hwp_bench.capture.writer import combine
+from hwp_bench.hands.raster import draw_bones
 from hwp_bench.hands.template import HandTemplate
 from hwp_bench.taxonomy import perturbation
 
@@ -392,12 +392,6 @@ def _numbers(capture: Capture) -> Iterator[Finding]:
 
 #: Colour of the projected hand, by side.
 COLOURS = {"right": (255, 160, 0), "left": (0, 170, 255)}
-#: The 20 bones between the 21 landmarks: wrist to each finger's base, then outwards.
-BONES = tuple(
-    (0 if joint == 0 else 4 * finger + joint, 4 * finger + joint + 1)
-    for finger in range(5)
-    for joint in range(4)
-)
 
 
 def contact_sheet(capture: Capture, *, count: int = 24, edge: int = 256) -> np.ndarray:
@@ -425,51 +419,25 @@ def project_landmarks(capture: Capture, frames: list[int]) -> Iterator[dict[str,
     """Yield, for each frame, the projected landmarks (21, 2) px of every valid hand, by side."""
     import torch
 
-    from hwp_bench.hands import load_template, pose_hand, project
+    from hwp_bench.hands import load_template, project
+    from hwp_bench.hands.skinning import pose_parameters
 
     Ks = torch.from_numpy(capture.cameras.Ks[frames])
     viewmats = torch.from_numpy(capture.cameras.viewmats[frames])
     pixels: dict[str, np.ndarray] = {}
     for side, hand in capture.hands.items():
-        tensors = load_template(capture.info.hand_model.source, side).to_torch(torch.float64)
-        posed = pose_hand(
-            tensors,
-            torch.from_numpy(hand.pose[frames]),
-            torch.from_numpy(hand.betas).expand(len(frames), -1),
-            torch.from_numpy(hand.transl[frames]),
-        )
+        template = load_template(capture.info.hand_model.source, side)
+        posed = pose_parameters(template, hand, frames)
         pixels[side] = project(posed.landmarks, viewmats, Ks)[0].numpy()
-    for index, frame in enumerate(frames):
-        yield {
-            side: points[index]
-            for side, points in pixels.items()
-            if capture.hands[side].valid[frame]
-        }
+    for row, frame in enumerate(frames):
+        yield {s: places[row] for s, places in pixels.items() if capture.hands[s].valid[frame]}
 
 
 def draw_hands(image: np.ndarray, points: dict[str, np.ndarray]) -> np.ndarray:
-    """Draw skeletons into a copy of an image.
-
-    Args:
-        image: (H, W, 3) uint8.
-        points: (21, 2) px by side, pixel centres at +0.5.
-    """
+    """Draw skeletons, (21, 2) px by side, into a copy of an image (H, W, 3) uint8."""
     canvas = image.copy()
     for side, landmarks in points.items():
-        # OpenCV counts pixel centres from 0, in fixed point with 3 fractional bits here.
-        # Beyond 1e6 it draws nothing anyway; NaN is far off too.
-        places = np.nan_to_num((landmarks - 0.5) * 8, nan=1e6)
-        spots = np.clip(places, -1e6, 1e6).round().astype(int)
-        for first, last in BONES:
-            cv2.line(
-                canvas,
-                tuple(spots[first].tolist()),
-                tuple(spots[last].tolist()),
-                COLOURS[side],
-                1,
-                cv2.LINE_AA,
-                3,
-            )
+        draw_bones(canvas, landmarks, COLOURS[side])
     return canvas
 
 

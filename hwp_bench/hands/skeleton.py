@@ -42,6 +42,13 @@ SIDES = ("right", "left")
 _LANDMARKS = (0, 13, 14, 15, 16, 1, 2, 3, 17, 4, 5, 6, 18, 10, 11, 12, 19, 7, 8, 9, 20)
 
 
+#: Pairs of landmarks that a drawing connects.
+LANDMARK_EDGES = (
+    *((0, 4 * finger + 1) for finger in range(5)),
+    *((4 * finger + k, 4 * finger + k + 1) for finger in range(5) for k in (1, 2, 3)),
+)
+
+
 def landmark_order() -> tuple[int, ...]:
     """Rows of [16 joints, 5 finger tips] that make the 21 landmarks of OpenPose and MediaPipe.
 

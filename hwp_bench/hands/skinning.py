@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 
 from hwp_bench.base.errors import BadInput, ShapeMismatch
 from hwp_bench.hands.articulation import axis_angle_to_matrix
-from hwp_bench.hands.skeleton import JOINT_COUNT, SHAPE_COUNT, landmark_order
-from hwp_bench.hands.template import TemplateTensors
+from hwp_bench.hands.skeleton import JOINT_COUNT, SHAPE_COUNT, HandParameters, landmark_order
+from hwp_bench.hands.template import HandTemplate, TemplateTensors
 
 # The joints at each distance from the wrist, one of each finger; every template has this tree.
 _LEVELS = (slice(1, None, 3), slice(2, None, 3), slice(3, None, 3))
@@ -84,6 +85,15 @@ def pose_hand(
         landmarks=torch.cat([points[:, rows] for rows in _landmark_rows()], dim=1),
         transforms=_homogeneous(turns, shifts),
     )
+
+
+def pose_parameters(
+    template: HandTemplate, hand: HandParameters, frames: Sequence[int] | slice = slice(None)
+) -> PosedHand:
+    """Pose a hand in some frames, in float64 and without gradients."""
+    arrays = (hand.pose[frames], hand.betas, hand.transl[frames])
+    with torch.no_grad():
+        return pose_hand(template.to_torch(torch.float64), *map(torch.from_numpy, arrays))
 
 
 @functools.cache

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -20,26 +20,26 @@ from hwp_bench.base.console import notice
 from hwp_bench.base.errors import BadInput, UsageError, bounded
 from hwp_bench.base.files import check_is_file, inside, read_json
 from hwp_bench.base.images import is_blank, read_rgb
-from hwp_bench.capture import Cameras, CaptureInfo, identify_hand_model
+from hwp_bench.capture import Cameras
 from hwp_bench.capture.convert import with_one_shape
 from hwp_bench.capture.schema import MAX_FRAMES
 from hwp_bench.hands import HandParameters, HandTemplate, load_template
-from hwp_bench.hands.fitting import FitTargets, fit_hand
+from hwp_bench.hands.fitting import FitTargets
 from hwp_bench.hands.raster import draw_silhouette
+from hwp_bench.hands.skinning import pose_parameters
 from hwp_bench.importers.shared.frames import CropWindows, cut, follow_hands, resample
 from hwp_bench.importers.shared.landmarks import Landmarks
 from hwp_bench.importers.shared.output import (
+    CHOICES,
     ProjectedHand,
-    overlay_sheet,
-    pose_parameters,
+    ReleaseImport,
+    check_choices,
+    fit_free_hand,
     project_hand,
     refuse_existing,
-    sheet_frames,
     write_capture,
 )
 
-#: The hands that can be asked for.
-CHOICES = ("auto", "right", "left", "both")
 #: Fewest frames of a capture.
 FEWEST = 3
 #: Terms of the data set.
@@ -106,38 +106,21 @@ def find_sequence(name: str) -> InterHandSequence:
     return InterHandSequence(int(match.group(2)), match.group(3), match.group(4), match.group(1))
 
 
-@dataclass(frozen=True)
-class InterHandImport:
-    """Choices of an import; checked when made.
+@dataclass(frozen=True, kw_only=True)
+class InterHandImport(ReleaseImport):
+    """Choices of an import, also those of `ReleaseImport`; checked when made."""
 
-    Raises:
-        UsageError: a choice makes no sense.
-    """
-
-    #: MANO file or folder, or None to fit the free hand to the annotated joints.
-    mano: Path | None = None
-    #: Edge of the stored square frames, px.
-    size: int = 256
     #: Frames per second of the annotated frames; the data set comes at 5 and at 30.
     fps: float = 5.0
-    #: The hands that are imported: `right`, `left`, `both`, or `auto`: those that the data set
-    #: says the sequence shows.
+    #: One of `CHOICES`; `auto`: the hands that the data set says the sequence shows.
     side: str = "auto"
-    #: Replace an existing capture.
-    overwrite: bool = False
 
     def __post_init__(self) -> None:
-        if self.side not in CHOICES:
-            raise UsageError(f"must be one of {', '.join(CHOICES)}", field="--side")
-        if not 32 <= self.size <= 2048:
-            raise UsageError("must be 32 to 2048 px", field="--size")
-        if not 0 < self.fps < 1000:
-            raise UsageError("must be above 0 and below 1000", field="--fps")
-
-    @property
-    def model(self) -> str:
-        """The hand model, as `load_template` takes it."""
-        return "anny" if self.mano is None else f"mano:{Path(self.mano).absolute()}"
+        super().__post_init__()
+        check_choices(
+            ("--side", self.side in CHOICES, f"must be one of {', '.join(CHOICES)}"),
+            ("--fps", 0 < self.fps < 1000, "must be above 0 and below 1000"),
+        )
 
 
 # --- Annotations
@@ -158,9 +141,7 @@ class ManoAnnotation:
 
     def select(self, kept: np.ndarray) -> ManoAnnotation:
         """Those of some frames, (F,) bool."""
-        return ManoAnnotation(
-            self.pose[kept], self.shape[kept], self.transl[kept], self.valid[kept]
-        )
+        return ManoAnnotation(*(getattr(self, part.name)[kept] for part in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -447,21 +428,31 @@ def import_interhand(
     cameras = Cameras(windows.intrinsics(records.K), viewmats)
     clips = projected(cameras.Ks)
     facts |= {"errors": errors, "crop_px": windows.side, "split": records.split}
-    info = _info(records, sequence, facts, options)
-    shown = set(sheet_frames(count))
-    images: dict[int, np.ndarray] = {}
-    masks: dict[int, np.ndarray] = {}
-
-    def frames() -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        for frame, (image, mask) in enumerate(_cropped_frames(records, clips, windows)):
-            if frame in shown:
-                images[frame], masks[frame] = image, mask
-            yield image, mask
-
-    def sheet() -> np.ndarray:
-        return overlay_sheet(clips, images, masks)
-
-    write_capture(out, info, hands, cameras, frames(), sheet, facts, overwrite=options.overwrite)
+    write_capture(
+        out,
+        hands,
+        cameras,
+        _cropped_frames(records, clips, windows),
+        clips,
+        facts,
+        overwrite=options.overwrite,
+        model=options.model,
+        size=options.size,
+        id=sequence.id,
+        action=sequence.name,
+        device=f"InterHand2.6M camera {sequence.camera}",
+        fps=options.fps,
+        perturbations={},
+        source={
+            "kind": "InterHand2.6M",
+            "sequence": f"{records.split}/{sequence.folder}",
+            "camera": sequence.camera,
+            "frames": records.frames.tolist(),
+            "masks": "silhouette of the annotated hands",
+            "import": facts,
+        },
+        licence=LICENCE,
+    )
     return facts
 
 
@@ -516,10 +507,7 @@ def _free_hand(
         raise _no_annotation("joints", side, root)
     mano = records.mano[side]
     pose = np.where(mano.valid[:, None, None], mano.pose, 0.0)
-    unplaced = HandParameters(pose, np.zeros(10), np.zeros((len(pose), 3)), valid)
-    shift = joints[:, 9] - pose_parameters(template, unplaced).landmarks[:, 9].numpy()
-    start = replace(unplaced, transl=np.where(valid[:, None], shift, 0.0))
-    return fit_hand(template, FitTargets(joints), start).parameters
+    return fit_free_hand(template, pose, valid, joints[:, 9], FitTargets(joints)).parameters
 
 
 def _joint_distance(
@@ -541,36 +529,6 @@ def _windows(clips: list[ProjectedHand], options: InterHandImport) -> CropWindow
     image = np.concatenate(points, axis=1)
     hand = Landmarks(image, np.zeros((len(image), 21, 3)), seen.astype(float), seen)
     return follow_hands([hand], options.fps, options.size)
-
-
-def _info(
-    records: InterHandRecords,
-    sequence: InterHandSequence,
-    facts: Mapping[str, Any],
-    options: InterHandImport,
-) -> CaptureInfo:
-    shown = "both" if len(records.sides) == 2 else records.sides[0]
-    return CaptureInfo(
-        id=sequence.id,
-        hands=shown,
-        action=sequence.name,
-        device=f"InterHand2.6M camera {sequence.camera}",
-        fps=options.fps,
-        width=options.size,
-        height=options.size,
-        frame_count=len(records.frames),
-        hand_model=identify_hand_model(options.model, shown),
-        perturbations={},
-        source={
-            "kind": "InterHand2.6M",
-            "sequence": f"{records.split}/{sequence.folder}",
-            "camera": sequence.camera,
-            "frames": records.frames.tolist(),
-            "masks": "silhouette of the annotated hands",
-            "import": dict(facts),
-        },
-        licence=LICENCE,
-    )
 
 
 def _cropped_frames(

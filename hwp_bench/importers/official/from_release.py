@@ -17,13 +17,15 @@ from typing import Any
 
 import numpy as np
 
-from hwp_bench.base.errors import BadInput, UsageError, bounded
+from hwp_bench.base.errors import BadInput, bounded
 from hwp_bench.base.files import sha256_file
 from hwp_bench.base.images import is_blank, read_gray
-from hwp_bench.capture import Cameras, CaptureInfo, identify_hand_model
+from hwp_bench.capture import Cameras
 from hwp_bench.capture.schema import check_id
 from hwp_bench.hands import HandParameters, HandTemplate, load_template
-from hwp_bench.hands.fitting import FitTargets, fit_hand
+from hwp_bench.hands.fitting import FitTargets
+from hwp_bench.hands.poses import mirrored
+from hwp_bench.hands.skinning import pose_parameters
 from hwp_bench.hands.sources import FINGERTIPS
 from hwp_bench.importers.official.crop import (
     MASK_THRESHOLD,
@@ -40,11 +42,11 @@ from hwp_bench.importers.official.records import (
 from hwp_bench.importers.shared.frames import cells
 from hwp_bench.importers.shared.output import (
     ProjectedHand,
-    overlay_sheet,
-    pose_parameters,
+    ReleaseImport,
+    check_choices,
+    fit_free_hand,
     project_hand,
     refuse_existing,
-    sheet_frames,
     write_capture,
 )
 from hwp_bench.taxonomy import catalogue
@@ -63,46 +65,25 @@ _TIP_ROWS = [4, 8, 12, 16, 20]
 _MIN_SHARE, _MIN_LEAD, _LOOKED_AT = 0.5, 0.1, 24
 
 
-@dataclass(frozen=True)
-class OfficialImport:
-    """Choices of an import; checked when made.
+@dataclass(frozen=True, kw_only=True)
+class OfficialImport(ReleaseImport):
+    """Choices of an import, also those of `ReleaseImport`; checked when made."""
 
-    Raises:
-        UsageError: a choice makes no sense.
-    """
-
-    #: MANO file or folder, or None to fit the free hand.
-    mano: Path | None = None
     #: Crop, intrinsics and translations as the released loader has them, mistakes included.
     official_compat: bool = False
     #: Which hand of a single-hand capture; None decides by the masks.
     hand: str | None = None
-    #: Edge of the stored frames, px.
-    size: int = 256
     #: Frames per second of the video before subsampling; the release does not state it.
     video_fps: float = 30.0
-    #: Replace an existing capture.
-    overwrite: bool = False
 
     def __post_init__(self) -> None:
-        rules = (
+        super().__post_init__()
+        whole = not self.official_compat or self.size == 256
+        check_choices(
             ("--hand", self.hand in (None, "right", "left"), "must be right or left"),
-            ("--size", 32 <= self.size <= 2048, "must be 32 to 2048 px"),
             ("--fps", 0 < self.video_fps < 1000, "must be above 0 and below 1000"),
-            (
-                "--official-compat",
-                not self.official_compat or self.size == 256,
-                "means frames of 256 px",
-            ),
+            ("--official-compat", whole, "means frames of 256 px"),
         )
-        for option, good, problem in rules:
-            if not good:
-                raise UsageError(problem, field=option)
-
-    @property
-    def model(self) -> str:
-        """The hand model, as `load_template` takes it."""
-        return "anny" if self.mano is None else f"mano:{Path(self.mano).absolute()}"
 
 
 def import_official(
@@ -130,47 +111,22 @@ def import_official(
     }
     tracked = tracked_joints(records, sides, crops, options.size)
     facts = _facts(folder, records, hands, clips, tracked, crops, warnings, options)
-    info = _info(folder, records, sides, facts, options)
-    shown = sheet_frames(len(crops))
-
-    def sheet() -> np.ndarray:
-        images = {frame: crops[frame].image for frame in shown}
-        masks = {frame: crops[frame].mask for frame in shown}
-        dots = {frame: tracked[frame] for frame in shown}
-        return overlay_sheet(list(clips.values()), images, masks, dots)
-
+    entry = catalogue().get(folder.id)
     write_capture(
         out,
-        info,
         {side: made.hand for side, made in hands.items()},
         cameras,
         ((crop.image, crop.mask) for crop in crops),
-        sheet,
+        list(clips.values()),
         facts,
         overwrite=options.overwrite,
-    )
-    return facts
-
-
-def _info(
-    folder: OfficialFolder,
-    records: OfficialRecords,
-    sides: tuple[str, ...],
-    facts: Mapping[str, Any],
-    options: OfficialImport,
-) -> CaptureInfo:
-    entry = catalogue().get(folder.id)
-    shown = "both" if len(sides) == 2 else sides[0]
-    return CaptureInfo(
+        model=options.model,
+        size=options.size,
+        tracked=tracked,
         id=folder.id,
-        hands=shown,
         action=entry.action if entry else "unknown",
         device=entry.device if entry else "unknown",
         fps=options.video_fps / (folder.subsample or 1),
-        width=options.size,
-        height=options.size,
-        frame_count=len(records.numbers),
-        hand_model=identify_hand_model(options.model, shown),
         perturbations=dict.fromkeys(entry.perturbations) if entry else {},
         source={
             "kind": "official HWP release",
@@ -180,10 +136,11 @@ def _info(
             "video_fps": {"value": options.video_fps, "from": "assumed, or given by the user"},
             "frames": records.numbers.tolist(),
             "focal": records.focal.tolist(),
-            "import": dict(facts),
+            "import": facts,
         },
         licence=LICENCE,
     )
+    return facts
 
 
 def _facts(
@@ -360,7 +317,7 @@ def _import_hand(
 
 def _own_rotations(pose: np.ndarray, side: str) -> np.ndarray:
     """Rotation vectors (F, 16, 3) of a hand in its own frame, of the tracker's."""
-    return pose if side == "right" else pose * np.array([1.0, -1.0, -1.0])
+    return pose if side == "right" else mirrored(pose)
 
 
 def _mano_hand(
@@ -412,8 +369,6 @@ def _free_hand(
     rays = np.concatenate([offsets, np.ones((*offsets.shape[:2], 1))], axis=2)
     rays /= np.linalg.norm(rays, axis=2, keepdims=True)
     pose = _own_rotations(np.where(valid[:, None, None], records.pose, 0.0), template.side)
-    unplaced = HandParameters(pose, np.zeros(10), np.zeros((len(pose), 3)), valid)
-    shift = knuckle - pose_parameters(template, unplaced).landmarks[:, 9].numpy()
-    start = replace(unplaced, transl=np.where(valid[:, None], shift, 0.0))
-    fitted = fit_hand(template, FitTargets(landmarks, rays, records.vertices[:, ::2]), start)
+    targets = FitTargets(landmarks, rays, records.vertices[:, ::2])
+    fitted = fit_free_hand(template, pose, valid, knuckle, targets)
     return ImportedHand(fitted.parameters, fitted.skin_mm)

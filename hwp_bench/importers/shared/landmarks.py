@@ -22,20 +22,14 @@ import numpy as np
 
 from hwp_bench.base.arrays import read_npz, take, write_npz
 from hwp_bench.base.errors import BadInput
+from hwp_bench.hands.skeleton import SIDES
 
 #: Version of the file that is written.
 VERSION = 2
-#: Sides in the order of `votes`.
-SIDES = ("right", "left")
 #: MediaPipe (= OpenPose) order, the order of every landmark array in this package.
 LANDMARK_NAMES = (
     "wrist",
     *(f"{finger}_{k}" for finger in ("thumb", "index", "middle", "ring", "little") for k in "1234"),
-)
-#: Pairs of landmarks that a drawing connects.
-LANDMARK_EDGES = (
-    *((0, 4 * finger + 1) for finger in range(5)),
-    *((4 * finger + k, 4 * finger + k + 1) for finger in range(5) for k in (1, 2, 3)),
 )
 #: Landmarks that move with the palm: wrist, thumb base, and the four knuckles.
 PALM = (0, 1, 5, 9, 13, 17)

@@ -10,24 +10,14 @@ import numpy as np
 
 from hwp_bench.base.files import sha256_file
 from hwp_bench.base.images import write_image
-from hwp_bench.capture import Cameras, CaptureInfo, identify_hand_model
+from hwp_bench.capture import Cameras
 from hwp_bench.hands import HandParameters
+from hwp_bench.hands.skeleton import SIDES
 from hwp_bench.importers.shared.landmarks import Landmarks
-from hwp_bench.importers.shared.output import (
-    ProjectedHand,
-    overlay_sheet,
-    sheet_frames,
-    write_capture,
-)
+from hwp_bench.importers.shared.output import write_capture
 from hwp_bench.importers.video.masks import ClipMasks, ProjectedClip
 from hwp_bench.importers.video.solve import FittedClip, ReprojectionError
-from hwp_bench.importers.video.source import (
-    BOTH,
-    LOW_OVERLAP,
-    VideoImport,
-    VideoSource,
-    fit_warnings,
-)
+from hwp_bench.importers.video.source import LOW_OVERLAP, VideoImport, VideoSource, fit_warnings
 
 #: Version of the fit and the masks. It is raised when they come out otherwise for the same input,
 #: because scores on captures of two versions do not compare.
@@ -142,53 +132,34 @@ class ImportedClip:
 
 
 def store_clip(
-    clip: ImportedClip, out: str | os.PathLike[str], options: VideoImport, call: str | None = None
+    clip: ImportedClip, out: str | os.PathLike[str], options: VideoImport, call: str
 ) -> None:
     """Write the capture, whole or not at all, and the separate sheet where one is asked for.
 
     `call` is the digest of the call that makes it, by which a second one knows that it is complete.
     """
-    source = clip.source
-    frames = len(source.indices)
-    K = np.array(
-        [
-            [clip.focal, 0, source.video.width / 2],
-            [0, clip.focal, source.video.height / 2],
-            [0, 0, 1.0],
-        ]
-    )
-    cameras = Cameras(source.windows.intrinsics(K), np.tile(np.eye(4), (frames, 1, 1)))
-    drawn = draw_sheet(clip)
-    write_capture(
-        out,
-        capture_info(clip, out, options),
-        {side: clip.hands[side].parameters for side in BOTH if side in clip.hands},
-        cameras,
-        zip(source.images.frames, clip.masks.coverage, strict=True),
-        lambda: drawn,
-        {**clip.facts(), **({} if call is None else {"call": call})},
-        overwrite=options.overwrite,
-    )
-    if options.sheet is not None:
-        write_image(options.sheet, drawn)
-
-
-def capture_info(
-    clip: ImportedClip, out: str | os.PathLike[str], options: VideoImport
-) -> CaptureInfo:
-    """Return the capture's description."""
-    source = clip.source
+    source, facts = clip.source, clip.facts()
     video, windows = source.video, source.windows
-    return CaptureInfo(
+    count = len(source.indices)
+    middle = (video.width / 2, video.height / 2)
+    K = np.array([[clip.focal, 0, middle[0]], [0, clip.focal, middle[1]], [0, 0, 1.0]])
+    overview = write_capture(
+        out,
+        {side: clip.hands[side].parameters for side in SIDES if side in clip.hands},
+        Cameras(windows.intrinsics(K), np.tile(np.eye(4), (count, 1, 1))),
+        zip(source.images.frames, clip.masks.coverage, strict=True),
+        [hand.projected.drawn() for hand in clip.hands.values()],
+        {**facts, "call": call},
+        overwrite=options.overwrite,
+        model=options.hand_model,
+        size=windows.size,
+        tracked=_tracked_points(clip),
+        captions=[_caption(clip, frame) for frame in range(count)],
+        most=SHEET_FRAMES,
         id=options.capture_id(out),
-        hands=clip.shown,
         action=options.action,
         device=options.device,
         fps=video.fps / options.frames.stride,
-        width=windows.size,
-        height=windows.size,
-        frame_count=len(source.indices),
-        hand_model=identify_hand_model(options.hand_model, clip.shown),
         perturbations=dict.fromkeys(options.perturbations),
         source={
             "kind": "video",
@@ -209,47 +180,36 @@ def capture_info(
             },
             "frames": source.indices.tolist(),
             "crop": {"side": windows.side, "corners": windows.corners.tolist()},
-            "focal": {
-                "px": clip.focal,
-                "from": "estimate" if options.focal is None else "user",
-            },
+            "focal": {"px": clip.focal, "from": "estimate" if options.focal is None else "user"},
             "masks": "graph cut" if source.own_masks is None else "user",
-            "fit": clip.facts(),
+            "fit": facts,
         },
         licence=options.licence,
     )
+    if options.sheet is not None:
+        write_image(options.sheet, overview)
 
 
-def draw_sheet(clip: ImportedClip) -> np.ndarray:
-    """Draw evenly spaced frames with masks, meshes and joints, (H, W, 3) uint8."""
-    source, hands = clip.source, list(clip.hands.values())
-    count, size = len(source.indices), source.windows.size
-    images, masks, tracked, captions = {}, {}, {}, {}
-    for frame in sheet_frames(count, SHEET_FRAMES):
-        number = f"{source.indices[frame]}"
-        if source.reading is not None and source.reading.ends_early and frame == count - 1:
-            # At the front: long captions are cut.
-            number += f" (video ends early: {source.reading.counted()})"
-        captions[frame] = f"frame {number}: overlap {clip.masks.overlap[frame]:.2f}"
-        dots = [np.zeros((0, 2))]
-        for hand in hands:
-            if not hand.landmarks.detected[frame]:
-                captions[frame] += ", not detected"
-                continue
-            valid = "" if hand.parameters.valid[frame] else ", not valid"
-            captions[frame] += f", {hand.error.by_frame[frame]:.1f} px{valid}"
-            dots.append(hand.projected.in_crop(hand.landmarks.image[frame], frame, size))
-        images[frame], masks[frame] = source.images.frames[frame], clip.masks.coverage[frame]
-        tracked[frame] = np.concatenate(dots)
-    corners, scale = source.windows.corners[:, None], source.windows.scale
-    drawn = [
-        ProjectedHand(
-            hand.projected.vertices,
-            (hand.projected.pixels - corners) * scale,
-            (hand.projected.landmarks - corners) * scale,
-            hand.projected.faces,
-            np.ones(count, dtype=bool),
-        )
-        for hand in hands
-    ]
-    return overlay_sheet(drawn, images, masks, tracked, captions)
+def _tracked_points(clip: ImportedClip) -> np.ndarray:
+    """The tracker's landmarks in the crops, (F, N, 2) px; NaN where a hand is not detected."""
+    windows, points = clip.source.windows, []
+    for hand in clip.hands.values():
+        moved = windows.place(hand.landmarks.image)
+        points.append(np.where(hand.landmarks.detected[:, None, None], moved, np.nan))
+    return np.concatenate(points, axis=1)
+
+
+def _caption(clip: ImportedClip, frame: int) -> str:
+    """What the sheet says of a frame."""
+    number, reading = f"{clip.source.indices[frame]}", clip.source.reading
+    if reading is not None and reading.ends_early and frame == len(clip.source.indices) - 1:
+        # At the front: long captions are cut.
+        number += f" (video ends early: {reading.counted()})"
+    said = f"frame {number}: overlap {clip.masks.overlap[frame]:.2f}"
+    for hand in clip.hands.values():
+        if not hand.landmarks.detected[frame]:
+            said += ", not detected"
+            continue
+        valid = "" if hand.parameters.valid[frame] else ", not valid"
+        said += f", {hand.error.by_frame[frame]:.1f} px{valid}"
+    return said

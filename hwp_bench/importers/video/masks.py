@@ -20,6 +20,7 @@ from hwp_bench.hands.raster import draw_faces, draw_silhouette, overlap
 from hwp_bench.hands.template import boundary_vertices
 from hwp_bench.importers.shared.frames import CropWindows, cells, each_frame, resample
 from hwp_bench.importers.shared.landmarks import Landmarks
+from hwp_bench.importers.shared.output import ProjectedHand
 from hwp_bench.importers.video.decode import ClipImages
 from hwp_bench.importers.video.model import ClipModel, pose_vertices
 from hwp_bench.importers.video.residuals import FIELD_SIZE, signed_distance
@@ -328,13 +329,19 @@ class ProjectedClip:
     #: Where the crops lie.
     windows: CropWindows
 
-    def in_crop(self, pixels: np.ndarray, frame: int, edge: int) -> np.ndarray:
-        """Move pixels of a whole frame to its crop at `edge` px."""
-        return (pixels - self.windows.corners[frame]) * (edge / self.windows.side)
+    def drawn(self) -> ProjectedHand:
+        """The hand in the crops, as a sheet shows it."""
+        pixels, landmarks = map(self.windows.place, (self.pixels, self.landmarks))
+        shown = np.ones(len(self.pixels), dtype=bool)
+        return ProjectedHand(self.vertices, pixels, landmarks, self.faces, shown)
+
+    def in_crop(self, frame: int, edge: int) -> np.ndarray:
+        """(V, 2) px of the vertices in a frame's crop of `edge` px."""
+        return self.windows.place(self.pixels[frame], edge, frame)
 
     def silhouette(self, frame: int, edge: int) -> np.ndarray:
         """(edge, edge) uint8, 255 where the mesh is in a frame's crop."""
-        return draw_silhouette(self.in_crop(self.pixels[frame], frame, edge), self.faces, edge)
+        return draw_silhouette(self.in_crop(frame, edge), self.faces, edge)
 
 
 def project_clip(model: ClipModel, windows: CropWindows) -> ProjectedClip:
@@ -372,7 +379,7 @@ class ProjectedHands:
         prompts = []
         for hand, shown in zip(self.hands, self.shown[:, frame], strict=True):
             if shown:
-                pixels = hand.in_crop(hand.pixels[frame], frame, edge)
+                pixels = hand.in_crop(frame, edge)
                 beyond = beyond_wrist(hand.vertices[frame], pixels, hand.ring, edge)
                 prompts.append(Prompt(hand.silhouette(frame, edge), beyond, detected))
         if not prompts:
@@ -422,10 +429,11 @@ class ProjectedHands:
         def weights(frame: int) -> np.ndarray:
             if not self.shown[:, frame].all():
                 return np.ones(own.landmarks.shape[1])
-            pixels = other.in_crop(other.pixels[frame], frame, edge)
+            pixels = other.in_crop(frame, edge)
             depth = other.vertices[frame, :, 2]
             face, _ = draw_faces(pixels, depth, other.faces, (edge, edge))
-            rows, columns, _ = cells(own.in_crop(own.landmarks[frame], frame, edge), face.shape)
+            places = own.windows.place(own.landmarks[frame], edge, frame)
+            rows, columns, _ = cells(places, face.shape)
             found = face[rows, columns]
             surface = depth[other.faces[found]].mean(axis=1)
             hidden = (found >= 0) & (own.depths[frame] > surface + _BEHIND)
@@ -439,7 +447,7 @@ class ProjectedHands:
         if not shown.all():
             return np.full((edge, edge), int(shown[1] and not shown[0]))
         first, second = self.hands
-        pixels = [hand.in_crop(hand.pixels[frame], frame, edge) for hand in self.hands]
+        pixels = [hand.in_crop(frame, edge) for hand in self.hands]
         depth = np.concatenate([hand.vertices[frame, :, 2] for hand in self.hands])
         faces = np.concatenate([first.faces, second.faces + len(pixels[0])])
         face, _ = draw_faces(np.concatenate(pixels), depth, faces, (edge, edge))

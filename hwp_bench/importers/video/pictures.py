@@ -73,8 +73,7 @@ class HandPictures:
         vertices = pose_vertices(model)
         with torch.no_grad():
             pixels = model.pixels(torch.as_tensor(vertices)).numpy()
-        inside = (pixels - self.windows.corners[:, None]) * self.ratio
-        return vertices, inside.astype(np.float32)
+        return vertices, self.windows.place(pixels, self.images.shape[1]).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)

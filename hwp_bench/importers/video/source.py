@@ -10,7 +10,7 @@ separate the colours on them from those around them better than any that lie els
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -22,9 +22,9 @@ from hwp_bench.base.console import notice, progress
 from hwp_bench.base.errors import BadInput, UsageError, has_odd_characters
 from hwp_bench.base.records import MAX_TEXT
 from hwp_bench.capture.schema import MAX_FRAMES
+from hwp_bench.hands.skeleton import LANDMARK_EDGES, SIDES
 from hwp_bench.importers.shared.frames import CropWindows, cells, follow_hands
 from hwp_bench.importers.shared.landmarks import (
-    LANDMARK_EDGES,
     Association,
     Landmarks,
     check_against_video,
@@ -32,6 +32,7 @@ from hwp_bench.importers.shared.landmarks import (
     read_hand_tracks,
     read_landmarks,
 )
+from hwp_bench.importers.shared.output import CHOICES, check_choices
 from hwp_bench.importers.video.decode import (
     ClipImages,
     FrameRange,
@@ -51,12 +52,6 @@ from hwp_bench.importers.video.solve import (
     side_scores,
     warn_of_contradiction,
 )
-
-#: Sides of two hands, in the order in which a capture has them.
-BOTH = ("right", "left")
-
-#: The hands that can be asked for, as the person sees them; `auto` is what the landmarks show.
-CHOICES = ("auto", "right", "left", "both")
 
 
 @dataclass(frozen=True)
@@ -99,24 +94,21 @@ class VideoImport:
     fit: FitSettings = field(default_factory=FitSettings)
 
     def __post_init__(self) -> None:
-        rules = (
+        # Texts have the bounds that they have in `capture.json`, which is written after all work.
+        texts = {name: getattr(self, name) for name in ("action", "device", "licence")}
+        texts["hand-model"] = self.hand_model
+        long = f"must have 1 to {MAX_TEXT:,} characters"
+        check_choices(
             ("--side", self.side in CHOICES, f"must be one of {', '.join(CHOICES)}"),
             ("--focal", self.focal is None or 1 <= self.focal <= 1e6, "must be 1 to 1e6 px"),
             ("--size", 32 <= self.size <= 2048, "must be 32 to 2048 px"),
             ("--min-score", 0 <= self.min_score <= 1, "must be in [0, 1]"),
-            *self._text_rules(),
+            *((f"--{name}", 1 <= len(text) <= MAX_TEXT, long) for name, text in texts.items()),
+            *(
+                (f"--{name}", not has_odd_characters(text), "holds a control character")
+                for name, text in texts.items()
+            ),
         )
-        for option, good, problem in rules:
-            if not good:
-                raise UsageError(problem, field=option)
-
-    def _text_rules(self) -> Iterator[tuple[str, bool, str]]:
-        """The same bounds as in `capture.json`, which is written after all the work."""
-        texts = {name: getattr(self, name) for name in ("action", "device", "licence")}
-        for name, text in {**texts, "hand-model": self.hand_model}.items():
-            long = f"must have 1 to {MAX_TEXT:,} characters"
-            yield f"--{name}", 1 <= len(text) <= MAX_TEXT, long
-            yield f"--{name}", not has_odd_characters(text), "holds a control character"
 
     def capture_id(self, out: str | os.PathLike[str]) -> str:
         """Return the id of the capture that is written to `out`."""
@@ -192,7 +184,7 @@ def read_source(
         scores = side_scores(hand, options.hand_model, footage)
         if given is not None:
             votes = None if tracked is None else tracked.votes(given)
-            warn_of_contradiction(given, scores, votes, stated=options.side in BOTH)
+            warn_of_contradiction(given, scores, votes, stated=options.side in SIDES)
         hands[given or scores.better] = hand
     windows = follow_hands(list(hands.values()), footage.fps, options.size)
     _check_memory(windows)
@@ -215,7 +207,7 @@ def _read_hands(
 ) -> dict[str | None, Landmarks]:
     """Landmarks by side; the key is None where the file says nothing of it and nobody else."""
     sides: tuple[str | None, ...]
-    if options.side in BOTH:
+    if options.side in SIDES:
         sides = (options.side,)
     else:
         sides = (None,) if tracked is None else tracked.sides
