@@ -19,6 +19,7 @@ from hwp_bench.capture.schema import (
     HANDS,
     IMAGE_FOLDERS,
     METADATA,
+    RGB_KINDS,
     SIDES,
     TRUE_HANDS,
     TRUE_TEMPLATE,
@@ -146,23 +147,28 @@ class Capture:
             BadImage: missing, damaged or of another size.
             UsageError: the capture has no such frame.
         """
-        return read_rgb(self._path("frames", frame), self.size)
+        return self.image("frames", frame)
 
     def mask(self, frame: int) -> np.ndarray:
         """Read the visible-hand mask that methods are given: (H, W) uint8, 255 = hand."""
-        return read_gray(self._path("masks", frame), self.size)
+        return self.image("masks", frame)
 
     def clean(self, frame: int) -> np.ndarray:
         """Read the clean version of a frame: (H, W, 3) uint8 sRGB."""
-        return read_rgb(self._path("clean", frame), self.size)
+        return self.image("clean", frame)
 
     def true_mask(self, frame: int) -> np.ndarray:
         """Read the exact coverage of visible hand: (H, W) uint8, 255 = covered fully."""
-        return read_gray(self._path("true_masks", frame), self.size)
+        return self.image("true_masks", frame)
 
     def clean_mask(self, frame: int) -> np.ndarray:
         """Read the visible hand of the clean frame: (H, W) uint8, 255 = covered fully."""
-        return read_gray(self._path("clean_masks", frame), self.size)
+        return self.image("clean_masks", frame)
+
+    def image(self, kind: str, frame: int) -> np.ndarray:
+        """Read an image of a kind, a key of `IMAGE_FOLDERS`; other arguments as of `frame`."""
+        path = image_path(self.root, kind, self._check(frame))
+        return (read_rgb if kind in RGB_KINDS else read_gray)(path, self.size)
 
     def hand_poses(self, frame: int) -> dict[str, HandPose]:
         """Return the estimated parameters of every hand in one frame, by side.
@@ -214,9 +220,6 @@ class Capture:
         if self.has_true_masks:
             return self.true_mask(frame), True
         return self.mask(frame), False
-
-    def _path(self, kind: str, frame: int) -> Path:
-        return image_path(self.root, kind, self._check(frame))
 
     def _check(self, frame: int) -> int:
         frame = whole_number(frame, "frame")
@@ -293,7 +296,11 @@ def load_matching_template(
         )
     if first.digest != model.digest:
         other = "left" if sides[0] == "right" else "right"
-        if model.digest == _digest(model.source, other):
+        try:
+            exchanged = model.digest == load_template(model.source, other).digest
+        except HwpError:  # it cannot be loaded here
+            exchanged = False
+        if exchanged:
             raise BadCapture(
                 f"is the digest of the {other} hand of {model.name}; the capture's first hand is "
                 f"the {sides[0]} one",
@@ -310,11 +317,3 @@ def load_matching_template(
             remedy=_CONVERT,
         )
     return first if side == sides[0] else load_template(model.source, side)
-
-
-def _digest(source: str, side: str) -> str | None:
-    """Digest of one hand of a model; None where it cannot be loaded."""
-    try:
-        return load_template(source, side).digest
-    except HwpError:
-        return None

@@ -18,7 +18,7 @@ from hwp_bench.base.files import canonical_json, check_is_file, sha256_of
 from hwp_bench.capture import open_capture
 from hwp_bench.importers.shared.landmarks import read_association, read_landmarks
 from hwp_bench.importers.video import FrameRange, VideoImport, import_video
-from hwp_bench.importers.video.clip import IMPORTER_VERSION
+from hwp_bench.importers.video.api import IMPORTER_VERSION
 from hwp_bench.importers.video.decode import probe
 from hwp_bench.methods.contract import Budget
 from hwp_bench.tracking import TrackerSettings, track_video

@@ -510,7 +510,6 @@ def cut_masks(
     detected: np.ndarray,
     hand_size: float,
     settings: MaskSettings,
-    *,
     own: np.ndarray | None = None,
     reduction: int = 1,
     update: Callable[[int], None] | None = None,

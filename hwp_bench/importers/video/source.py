@@ -52,6 +52,7 @@ from hwp_bench.importers.video.solve import (
     side_scores,
     warn_of_contradiction,
 )
+from hwp_bench.taxonomy import perturbation
 
 
 @dataclass(frozen=True)
@@ -109,6 +110,8 @@ class VideoImport:
                 for name, text in texts.items()
             ),
         )
+        for name in self.perturbations:
+            perturbation(name)
 
     def capture_id(self, out: str | os.PathLike[str]) -> str:
         """Return the id of the capture that is written to `out`."""

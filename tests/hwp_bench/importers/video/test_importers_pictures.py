@@ -103,10 +103,10 @@ def test_a_lit_hand_comes_nearer_to_its_truth_than_by_outline_and_texture() -> N
     before, free = pixel_error(fitted), fitted.model.variables
     held = {name: getattr(free, name).detach().clone() for name in ("betas", "log_depth")}
     done: list[int] = []
-    fit_picture(fitted, picture_of(fitted), done.append)
+    fit_picture(fitted, picture_of(fitted), lambda: done.append(1))
     # 0.75 and 0.61 px when this was written.
     assert pixel_error(fitted) < 0.88 * before
-    assert done == [40, 80, 120]
+    assert len(done) == 120
     for name, value in held.items():
         assert torch.equal(getattr(free, name), value)
 
