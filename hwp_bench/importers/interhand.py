@@ -199,44 +199,37 @@ class _Annotations:
         name = f"InterHand2.6M_{self.split}_{kind}.json"
         return self.root / "annotations" / self.split / name
 
-    def of_capture(self, kind: str) -> tuple[Path, dict[str, Any]]:
-        """The file of a kind, and what it says of the sequence's capture."""
-        path, capture = self.path(kind), str(self.sequence.capture)
-        value = read_json(path, max_bytes=MAX_BYTES)
-        found = value.get(capture) if isinstance(value, dict) else None
-        if not isinstance(found, dict):
-            raise BadInput("is missing", where=path, field=capture)
-        return path, found
+    def of_capture(self, kind: str) -> _Record:
+        """What the file of a kind says of the sequence's capture."""
+        whole = _Record(read_json(self.path(kind), max_bytes=MAX_BYTES), self.path(kind))
+        return whole.part(str(self.sequence.capture))
 
     def frames(self) -> list[dict[str, Any]]:
         """The records of the annotated frames of the camera, by frame number."""
         sequence, path = self.sequence, self.path("data")
-        data, where = read_json(path, max_bytes=MAX_BYTES), path.parent
-        if not isinstance(data, dict):
-            raise BadInput("is not a JSON object", where=path)
-        wanted = (str(sequence.capture), sequence.name, sequence.camera)
+        data, where = _Record(read_json(path, max_bytes=MAX_BYTES), path), path.parent
+        named = (str(sequence.capture), sequence.name, str(sequence.camera))
         chosen = {
             image.get("id"): image
-            for image in _objects(data, "images", where)
-            if (str(image.get("capture")), image.get("seq_name"), str(image.get("camera")))
-            == wanted
+            for image in data.objects("images")
+            if (str(image.get("capture")), image.get("seq_name"), str(image.get("camera"))) == named
         }
         types = {
             item.get("image_id"): item.get("hand_type")
-            for item in _objects(data, "annotations", where)
+            for item in data.objects("annotations")
             if item.get("image_id") in chosen
         }
         rows = []
         for key, image in chosen.items():
-            row = {**image, "hand_type": types.get(key)}
-            for name in ("frame_idx", "width", "height"):
-                try:
-                    row[name] = int(row[name])
-                except (KeyError, TypeError, ValueError) as error:
-                    problem = f"image {key} does not have it"
-                    raise BadInput(problem, where=where, field=name) from error
-            if not isinstance(row.get("file_name"), str):
-                raise BadInput(f"image {key} does not have it", where=where, field="file_name")
+            row, field = {**image, "hand_type": types.get(key)}, "file_name"
+            good = isinstance(row.get(field), str)
+            try:
+                for field in ("frame_idx", "width", "height") if good else ():
+                    row[field] = int(row[field])
+            except (KeyError, TypeError, ValueError):
+                good = False
+            if not good:
+                raise BadInput(f"image {key} does not have it", where=where, field=field)
             if row["hand_type"] in ("right", "left", "interacting"):
                 rows.append(row)
         if not 1 <= len(rows) <= MAX_FRAMES:
@@ -247,25 +240,20 @@ class _Annotations:
             )
         rows.sort(key=lambda row: row["frame_idx"])
         if len({row["frame_idx"] for row in rows}) < len(rows):
-            raise BadInput(
-                f"lists a frame of {sequence.name} twice", where=where, field="frame_idx"
-            )
+            said = f"lists a frame of {sequence.name} twice"
+            raise BadInput(said, where=where, field="frame_idx")
         return rows
 
     def camera(self) -> tuple[np.ndarray, np.ndarray]:
         """Intrinsics (3, 3) px, and (4, 4) world to camera, m."""
-        path, capture = self.of_capture("camera")
-        sequence = self.sequence
-
-        def numbers(name: str, *shape: int) -> np.ndarray:
-            table = capture.get(name)
-            value = table.get(sequence.camera) if isinstance(table, dict) else None
-            return _numbers(value, shape, path, f"{sequence.capture}.{name}.{sequence.camera}")
-
-        position, rotation = numbers("campos", 3) / 1000.0, numbers("camrot", 3, 3)
-        focal, centre = numbers("focal", 2), numbers("princpt", 2)
+        capture, camera = self.of_capture("camera"), self.sequence.camera
+        position = capture.part("campos").numbers(camera, (3,)) / 1000.0
+        rotation = capture.part("camrot").numbers(camera, (3, 3))
+        focal = capture.part("focal").numbers(camera, (2,))
+        centre = capture.part("princpt").numbers(camera, (2,))
         if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-2 or focal.min() <= 0:
-            raise BadInput("is not a rotation, or a focal length is not above 0", where=path)
+            said = "is not a rotation, or a focal length is not above 0"
+            raise BadInput(said, where=capture.path)
         # Written with six digits, it is a rotation only to about 1e-6: take the nearest one.
         left, _, right = np.linalg.svd(rotation)
         viewmat = np.eye(4)
@@ -276,16 +264,14 @@ class _Annotations:
 
     def joints(self, keys: list[str], sides: tuple[str, ...]) -> dict[str, np.ndarray]:
         """(F, 21, 3) m by side."""
-        path, capture = self.of_capture("joint_3d")
+        capture = self.of_capture("joint_3d")
         found = {side: np.full((len(keys), 21, 3), np.nan) for side in sides}
         for index, key in enumerate(keys):
-            frame = capture.get(key)
-            if not isinstance(frame, dict):
+            if not isinstance(capture.value.get(key), dict):
                 continue
-            field = f"{self.sequence.capture}.{key}"
-            coords, valid = frame.get("world_coord"), frame.get("joint_valid")
-            world = _numbers(coords, (42, 3), path, f"{field}.world_coord") / 1000.0
-            flags = _numbers(valid, (42,), path, f"{field}.joint_valid", flat=True)
+            frame = capture.part(key)
+            world = frame.numbers("world_coord", (42, 3)) / 1000.0
+            flags = frame.numbers("joint_valid", (42,), flat=True)
             for side in sides:
                 rows = _FIRST_JOINT[side] + np.array(LANDMARK_ROWS)
                 # Joints that are not valid are filled with ones.
@@ -296,56 +282,62 @@ class _Annotations:
         self, keys: list[str], sides: tuple[str, ...], *, needed: bool
     ) -> dict[str, ManoAnnotation]:
         """MANO parameters by side; none valid if they are not needed and not there."""
-        path = self.path(_MANO)
-        capture: dict[str, Any] = {}
-        if needed or path.exists():
-            path, capture = self.of_capture(_MANO)
+        capture = _Record({}, self.path(_MANO))
+        if needed or capture.path.exists():
+            capture = self.of_capture(_MANO)
         made = {}
         for side in sides:
             pose, shape, transl = (np.zeros((len(keys), n)) for n in (48, 10, 3))
             valid = np.zeros(len(keys), dtype=bool)
             for index, key in enumerate(keys):
-                frame = capture.get(key)
-                hand = frame.get(side) if isinstance(frame, dict) else None
-                if hand is None:
+                frame = capture.value.get(key)
+                if not isinstance(frame, dict) or frame.get(side) is None:
                     continue
-                field = f"{self.sequence.capture}.{key}.{side}"
-                if not isinstance(hand, dict):
-                    raise BadInput("is not a JSON object", where=path, field=field)
+                hand = capture.part(key).part(side)
                 for name, target in (("pose", pose), ("shape", shape), ("trans", transl)):
-                    value, length = hand.get(name), (target.shape[1],)
-                    target[index] = _numbers(value, length, path, f"{field}.{name}", flat=True)
+                    target[index] = hand.numbers(name, (target.shape[1],), flat=True)
                 valid[index] = True
             made[side] = ManoAnnotation(pose.reshape(-1, 16, 3), shape, transl, valid)
         return made
 
 
-def _objects(data: dict[str, Any], name: str, where: Path) -> list[dict[str, Any]]:
-    value = data.get(name)
-    if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
-        raise BadInput("is not a list of objects", where=where, field=name)
-    return value
+class _Record:
+    """A JSON object of a file, and the field that it is."""
 
+    def __init__(self, value: Any, path: Path, field: str | None = None) -> None:
+        if not isinstance(value, dict):
+            raise BadInput("is missing, or not a JSON object", where=path, field=field)
+        self.value, self.path, self._field = value, path, field
 
-def _numbers(
-    value: Any, shape: tuple[int, ...], where: Path, field: str, *, flat: bool = False
-) -> np.ndarray:
-    try:
-        array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise BadInput("is not a list of numbers", where=where, field=field) from error
-    array = array.reshape(-1) if flat else array
-    if array.shape != shape or not np.isfinite(array).all():
-        raise BadInput(f"is not a finite array of shape {shape}", where=where, field=field)
-    return array
+    def part(self, name: str) -> _Record:
+        """A JSON object in it."""
+        return _Record(self.value.get(name), self.path, self._place(name))
+
+    def objects(self, name: str) -> list[dict[str, Any]]:
+        """A list of JSON objects in it."""
+        value = self.value.get(name)
+        if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
+            raise BadInput("is not a list of objects", where=self.path, field=self._place(name))
+        return value
+
+    def numbers(self, name: str, shape: tuple[int, ...], *, flat: bool = False) -> np.ndarray:
+        """Numbers in it."""
+        where, field = self.path, self._place(name)
+        try:
+            array = np.asarray(self.value.get(name), dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise BadInput("is not a list of numbers", where=where, field=field) from error
+        array = array.reshape(-1) if flat else array
+        if array.shape != shape or not np.isfinite(array).all():
+            raise BadInput(f"is not a finite array of shape {shape}", where=where, field=field)
+        return array
+
+    def _place(self, name: str) -> str:
+        return name if self._field is None else f"{self._field}.{name}"
 
 
 def read_annotations(
-    root: str | os.PathLike[str],
-    sequence: InterHandSequence,
-    side: str = "auto",
-    *,
-    mano: bool = True,
+    root: str | os.PathLike[str], sequence: InterHandSequence, side: str, *, mano: bool
 ) -> InterHandRecords:
     """Read the annotations of one camera of one sequence.
 
@@ -368,21 +360,17 @@ def read_annotations(
         )
     sides = tuple(side for side in wanted if side in shown)
     sizes = {(row["width"], row["height"]) for row in rows}
-    if len(sizes) != 1 or not sides:
-        raise BadInput(
-            f"has frames of sizes {sorted(sizes)} and hands {sorted(types)}", where=files.images
-        )
-    K, viewmat = files.camera()
+    if len(sizes) != 1:
+        raise BadInput(f"has frames of sizes {sorted(sizes)}", where=files.images)
     frames = np.array([row["frame_idx"] for row in rows])
     keys = [str(frame) for frame in frames]
     return InterHandRecords(
-        split=files.split,
-        frames=frames,
-        images=images,
-        size=sizes.pop(),
-        sides=sides,
-        K=K,
-        viewmat=viewmat,
+        files.split,
+        frames,
+        images,
+        sizes.pop(),
+        sides,
+        *files.camera(),
         joints=files.joints(keys, sides),
         mano=files.mano(keys, sides, needed=mano),
     )

@@ -18,7 +18,7 @@ import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, Protocol
+from typing import IO, Any
 
 import numpy as np
 
@@ -261,30 +261,8 @@ def _download(wheel: Pinned, target: IO[bytes], opener: Opener) -> None:
 # --- The networks as functions of an image, run by LiteRT (the runtime of TensorFlow Lite)
 
 
-class HandNetworks(Protocol):
-    """Finds palms, and the landmarks of a hand."""
-
-    def palms(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Find palms.
-
-        Args:
-            image: (192, 192, 3) uint8 RGB.
-
-        Returns:
-            Boxes and keypoints (2016, 18), and logits of scores (2016,).
-        """
-
-    def hand(self, image: np.ndarray) -> SeenHand:
-        """Read the landmarks of the hand in an image, (224, 224, 3) uint8 RGB."""
-
-
 class LiteRtNetworks:
-    """MediaPipe's networks.
-
-    Args:
-        models: the two networks.
-        threads: of each network.
-    """
+    """MediaPipe's networks: they find palms, and the landmarks of a hand."""
 
     def __init__(self, models: HandModels, *, threads: int = 1) -> None:
         try:
@@ -300,12 +278,15 @@ class LiteRtNetworks:
         self._hand = _Network(runtime, models.hand, models.source, HAND_EDGE, hand_outputs, threads)
 
     def palms(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Find palms; see `HandNetworks`."""
+        """Find palms in (192, 192, 3) uint8 RGB.
+
+        Boxes and keypoints (2016, 18), and logits of scores (2016,).
+        """
         values, logits = self._palm(image)
         return values[0], logits[0, :, 0]
 
     def hand(self, image: np.ndarray) -> SeenHand:
-        """Read the landmarks of a hand; see `HandNetworks`."""
+        """Read the landmarks of the hand in an image, (224, 224, 3) uint8 RGB."""
         points, presence, right, world = self._hand(image)
         return SeenHand(
             points.reshape(21, 3), world.reshape(21, 3), float(presence[0, 0]), float(right[0, 0])

@@ -25,7 +25,7 @@ from hwp_bench.importers.video.decode import (
     read_frames,
     warn_of_damage,
 )
-from hwp_bench.tracking.networks import HandNetworks, LiteRtNetworks, load_models
+from hwp_bench.tracking.networks import LiteRtNetworks, load_models
 from hwp_bench.tracking.tracker import Collected, HandTracker, TrackerSettings
 
 
@@ -79,7 +79,7 @@ def track_video(
     settings: TrackerSettings | None = None,
     model: Path | None = None,
     overwrite: bool = False,
-    networks: HandNetworks | None = None,
+    networks: LiteRtNetworks | None = None,
 ) -> TrackedVideo:
     """Track the hands of a video and write their landmarks.
 
@@ -127,7 +127,7 @@ def track_video(
 
 def track_frames(
     frames: Iterable[np.ndarray],
-    networks: HandNetworks,
+    networks: LiteRtNetworks,
     settings: TrackerSettings,
     update: Any = None,
 ) -> Collected:

@@ -26,7 +26,7 @@ from hwp_bench.tracking.detection import (
     place_in_image,
     suppress,
 )
-from hwp_bench.tracking.networks import HandNetworks
+from hwp_bench.tracking.networks import LiteRtNetworks
 
 #: Two regions with more overlap than this show one hand.
 _SAME_REGION = 0.5
@@ -72,7 +72,7 @@ class HandTracker:
         settings: thresholds.
     """
 
-    def __init__(self, networks: HandNetworks, settings: TrackerSettings | None = None) -> None:
+    def __init__(self, networks: LiteRtNetworks, settings: TrackerSettings | None = None) -> None:
         self._networks = networks
         self._settings = settings or TrackerSettings()
         self._followed: list[TrackedHand] = []

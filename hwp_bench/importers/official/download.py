@@ -8,7 +8,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from hwp_bench.base.errors import BadInput, HwpError, MissingDependency, UsageError
 from hwp_bench.base.files import cache_root, inside, read_json, sha256_file, write_json
@@ -33,16 +33,6 @@ class RemoteFile:
     size: int | None
     #: SHA-256 (hex) that the hub states for large files, or None.
     sha256: str | None
-
-
-class Hub(Protocol):
-    """A server of the release."""
-
-    def files(self, revision: str | None) -> tuple[str, list[RemoteFile]]:
-        """Return the commit that a revision names, and its files."""
-
-    def fetch(self, name: str, commit: str, folder: Path) -> Path:
-        """Download one file below a folder, going on where an earlier try stopped."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +93,7 @@ class HuggingFaceHub:
 
 def download_release(
     out: str | os.PathLike[str],
-    hub: Hub,
+    hub: HuggingFaceHub,
     *,
     captures: Sequence[str] = (),
     revision: str | None = None,
