@@ -49,16 +49,9 @@ def draw_faces(
 
 
 def draw_silhouette(pixels: np.ndarray, faces: np.ndarray, size: int) -> np.ndarray:
-    """Draw the area that a mesh covers: pixels whose centre lies in a triangle.
+    """Draw the area that a mesh covers, (size, size) uint8, 255 where a pixel's centre is in it.
 
-    Args:
-        pixels: (V, 2) vertices in the image, px; pixel centres at +0.5.
-        faces: (F, 3) int, either orientation.
-        size: edge of the square image, px.
-
-    Returns:
-        (size, size) uint8, 255 where the mesh is. Triangles with a corner that is not finite
-        are left out.
+    Vertices are (V, 2) px. Triangles with a corner that is not finite are left out.
     """
     face, _ = draw_faces(pixels, np.ones(len(pixels)), faces, (size, size))
     return np.where(face >= 0, 255, 0).astype(np.uint8)
@@ -67,16 +60,9 @@ def draw_silhouette(pixels: np.ndarray, faces: np.ndarray, size: int) -> np.ndar
 def mix_corners(
     values: np.ndarray, faces: np.ndarray, face: np.ndarray, mix: np.ndarray
 ) -> np.ndarray:
-    """Interpolate values of the vertices at points of the surface.
+    """Interpolate values of the vertices (V, C) at P points of the surface: (P, C) float32.
 
-    Args:
-        values: (V, C) float.
-        faces: (T, 3) int.
-        face: (P,) which face each point is on.
-        mix: (P, 2) barycentric coordinates as `draw_faces` returns them.
-
-    Returns:
-        (P, C) float32.
+    `face` (P,) and `mix` (P, 2) are as `draw_faces` returns them.
     """
     result = np.empty((len(face), values.shape[1]), dtype=np.float32)
     _mix(np.ascontiguousarray(values, dtype=np.float32), faces, face, mix, result)

@@ -60,8 +60,17 @@ def pose_hand(
     Source: Romero et al., "Embodied Hands" (MANO), equations 2-5; the root joint's rest place
     stays where it is when the hand turns, as in the authors' code.
     """
-    frames = _frame_count(pose, betas, transl)
-    _check_type(template.vertices.dtype, pose=pose, betas=betas, transl=transl)
+    frames, own = pose.shape[0] if pose.dim() else 0, template.vertices.dtype
+    _check_shape("pose", pose, (frames, JOINT_COUNT, 3))
+    _check_shape("betas", betas, (SHAPE_COUNT,) if betas.dim() == 1 else (frames, SHAPE_COUNT))
+    _check_shape("transl", transl, (frames, 3))
+    for field, value in (("pose", pose), ("betas", betas), ("transl", transl)):
+        if value.dtype != own:
+            raise BadInput(
+                f"type is {value.dtype}, that of the template {own}",
+                field=field,
+                remedy="Convert it, or make the template with `to_torch(dtype)`.",
+            )
     if not flat_hand_mean:
         pose = torch.cat([pose[:, :1], pose[:, 1:] + template.mean_pose], dim=1)
     rotations = axis_angle_to_matrix(pose)
@@ -128,13 +137,9 @@ def project(
         ShapeMismatch: the arguments do not describe the same frames.
     """
     frames = points.shape[0]
-    for field, value, shape in (
-        ("points", points, (frames, *points.shape[1:2], 3)),
-        ("viewmats", viewmats, (frames, 4, 4)),
-        ("Ks", Ks, (frames, 3, 3)),
-    ):
-        if tuple(value.shape) != shape:
-            raise ShapeMismatch(f"shape is {tuple(value.shape)}, expected {shape}", field=field)
+    _check_shape("points", points, (frames, *points.shape[1:2], 3))
+    _check_shape("viewmats", viewmats, (frames, 4, 4))
+    _check_shape("Ks", Ks, (frames, 3, 3))
     in_camera = points @ viewmats[:, :3, :3].mT + viewmats[:, None, :3, 3]
     depth = in_camera[..., 2]
     tiny = torch.finfo(depth.dtype).eps
@@ -160,27 +165,9 @@ def only_fingertips(template: TemplateTensors) -> TemplateTensors:
     )
 
 
-def _frame_count(pose: torch.Tensor, betas: torch.Tensor, transl: torch.Tensor) -> int:
-    frames = pose.shape[0] if pose.dim() else 0
-    shape_of_betas = (SHAPE_COUNT,) if betas.dim() == 1 else (frames, SHAPE_COUNT)
-    for field, value, shape in (
-        ("pose", pose, (frames, JOINT_COUNT, 3)),
-        ("betas", betas, shape_of_betas),
-        ("transl", transl, (frames, 3)),
-    ):
-        if tuple(value.shape) != shape:
-            raise ShapeMismatch(f"shape is {tuple(value.shape)}, expected {shape}", field=field)
-    return frames
-
-
-def _check_type(expected: torch.dtype, **arguments: torch.Tensor) -> None:
-    for field, value in arguments.items():
-        if value.dtype != expected:
-            raise BadInput(
-                f"type is {value.dtype}, that of the template {expected}",
-                field=field,
-                remedy="Convert it, or make the template with `to_torch(dtype)`.",
-            )
+def _check_shape(field: str, value: torch.Tensor, shape: tuple[int, ...]) -> None:
+    if tuple(value.shape) != shape:
+        raise ShapeMismatch(f"shape is {tuple(value.shape)}, expected {shape}", field=field)
 
 
 def _forward_kinematics(
