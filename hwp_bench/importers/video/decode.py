@@ -155,16 +155,8 @@ def probe(path: str | os.PathLike[str]) -> VideoInfo:
                 where=path,
                 remedy=f"The file is damaged or cut off; if it plays elsewhere: {_AGAIN}",
             )
-        width, height = video.upright_size(frame)
-        return VideoInfo(
-            path=path,
-            width=width,
-            height=height,
-            fps=video.fps,
-            stated_frames=video.stated,
-            codec=video.codec,
-            colours=str(colours),
-        )
+        size = video.upright_size(frame)
+        return VideoInfo(path, *size, video.fps, video.stated, video.codec, str(colours))
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,17 +246,10 @@ def read_masks(
 def read_frames(
     info: VideoInfo, selection: FrameRange, ended: Callable[[Reading], None] | None = None
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """Decode the selected frames, one after the other.
+    """Decode the selected frames: yields the index in the video, and (H, W, 3) uint8 sRGB.
 
-    Args:
-        info: the probed video.
-        selection: which frames; those between are decoded and dropped, because seeking is not
-            exact in every container.
-        ended: is told what came of it when the video was read to its end, which a selection with
-            a `stop` does not do.
-
-    Yields:
-        (index in the video, (H, W, 3) uint8 sRGB).
+    Those between are decoded and dropped, because seeking is not exact in every container. `ended`
+    is told what came of it when the video was read to its end, which a `stop` prevents.
     """
     with _opened(info.path) as video:
         index = 0
@@ -300,13 +285,9 @@ _AGAIN = "ffmpeg -i VIDEO -c:v libx264 -crf 12 -pix_fmt yuv420p video.mp4"
 
 
 class _Video:
-    """An open file, and the stream of it that is the video.
+    """An open file, a container of PyAV's, and the stream of it that is the video.
 
-    Args:
-        path: the file, for messages.
-        container: PyAV's.
-        kind: key of `CONTAINERS`.
-        half_packet: whether the file ends within a packet of its container.
+    `kind` is a key of `CONTAINERS`; the file may end within a packet of its container.
     """
 
     def __init__(self, path: Path, container: Any, kind: str, *, half_packet: bool) -> None:
@@ -489,7 +470,10 @@ def _choose(container: Any, path: Path) -> Any:
         moving = _with_frames(container, moving)
     if not moving:
         raise BadInput("contains no video but a cover picture", where=path)
-    readable = [stream for stream in moving if _can_decode(stream)]
+    contexts = [stream.codec_context for stream in moving]
+    readable = [
+        one for one, context in zip(moving, contexts, strict=True) if context and context.codec
+    ]
     if not readable:
         names = ", ".join(_codec_name(stream) for stream in moving)
         raise BadInput(
@@ -517,10 +501,6 @@ def _with_frames(container: Any, streams: list[Any]) -> list[Any]:
     container.seek(0)
     most = min(max(counts.values()), _MOVING)
     return [stream for stream in streams if counts[stream.index] >= most]
-
-
-def _can_decode(stream: Any) -> bool:
-    return stream.codec_context is not None and stream.codec_context.codec is not None
 
 
 def _codec_name(stream: Any) -> str:

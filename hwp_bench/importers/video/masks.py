@@ -210,9 +210,8 @@ def segment_clip(
 ) -> Iterator[tuple[Prompt, Segmentation]]:
     """Segment every frame with one colour model for the whole clip.
 
-    Args:
-        image: gives the (S, S, 3) uint8 RGB image of a frame; called from several threads.
-        hand_size: px of these images.
+    `image` gives the (S, S, 3) uint8 RGB image of a frame, from several threads; `hand_size` is in
+    px of these images.
     """
     chosen = np.unique(np.linspace(0, count - 1, min(count, _COLOUR_FRAMES)).astype(int))
 
@@ -357,12 +356,7 @@ def project_clip(model: ClipModel, windows: CropWindows) -> ProjectedClip:
 
 
 class ProjectedHands:
-    """One hand or two, projected, as one prompt for the cut of their masks.
-
-    Args:
-        hands: one or two.
-        landmarks: of each.
-    """
+    """One hand or two, projected, as one prompt for the cut of their masks."""
 
     def __init__(self, hands: Sequence[ProjectedClip], landmarks: Sequence[Landmarks]) -> None:
         from scipy.ndimage import binary_dilation
@@ -471,11 +465,6 @@ def beyond_wrist(
     The open end of the mesh spans a plane; its normal points along the forearm. Seen at the
     wrist's depth, the plane cuts the image in a line, and the forearm lies behind the line. There
     is none for a mesh without an open end, or seen straight along the forearm.
-
-    Args:
-        vertices: (V, 3) camera axes, m.
-        pixels: (V, 2) px.
-        size: edge of the image, px.
     """
     if len(ring) < 3:
         return np.zeros((size, size), dtype=bool)
@@ -516,10 +505,8 @@ def cut_masks(
 ) -> ClipMasks:
     """Cut the masks of a clip, prompted by a fit.
 
-    Args:
-        detected: (F,) bool, frames whose pose comes from a detection.
-        hand_size: px of the working images.
-        own: (F, S, S) uint8 masks of the user's own at the working resolution, taken as they are.
+    In `detected` frames (F,) the pose comes from a detection. `hand_size` is in px of the working
+    images, and so are `own`, (F, S, S) uint8, masks of the user's own.
     """
     working, size = images.working, images.frames.shape[1]
     edge = working.shape[1] // reduction

@@ -127,12 +127,8 @@ class SurfaceResidual(ABC):
 
     `rematch` collects the surface with the model as it is and linearises the difference of each
     pixel. Within a round of descent the energy is then a quadratic function of the variables of
-    each frame, zero where it was linearised, which costs next to nothing.
-
-    Args:
-        pictures: of the clip.
-        model: the clip.
-        weight: of the energy of as many pixels as the hand's size squared.
+    each frame, zero where it was linearised, which costs next to nothing. `weight` is of the energy
+    of as many pixels as the hand's size squared.
     """
 
     def __init__(self, pictures: HandPictures, model: ClipModel, weight: float) -> None:
@@ -200,14 +196,8 @@ def linearize(
     """Differentiate half the weighed squared differences by the variables of their frame.
 
     A surface that moves by u takes its picture with it, so that a pixel gets less of what is
-    ahead of it: the difference grows by the picture's slope times u.
-
-    Args:
-        faces: (T, 3) of the hand.
-        ratio: px of the images to one px of the whole frame.
-
-    Returns:
-        Curvature (51, 51) and slope (51,).
+    ahead of it: the difference grows by the picture's slope times u. `ratio` is px of the images to
+    one px of the whole frame. Returns curvature (51, 51) and slope (51,).
     """
     shares = np.stack([1.0 - found.mix.sum(axis=1), found.mix[:, 0], found.mix[:, 1]], axis=1)
     corners = faces[found.face].ravel()

@@ -58,12 +58,7 @@ def smooth_within(values: np.ndarray, region: np.ndarray, breadth: float) -> np.
 
 
 class Atlas:
-    """The texels of a hand's texture map that lie on its surface, K of them.
-
-    Args:
-        template: the hand, with its texture coordinates.
-        edge: of the square map, texels.
-    """
+    """The texels of a hand's square texture map of `edge` texels that lie on it, K of them."""
 
     def __init__(self, template: HandTemplate, edge: int) -> None:
         self._faces = template.faces
