@@ -470,10 +470,7 @@ def _choose(container: Any, path: Path) -> Any:
         moving = _with_frames(container, moving)
     if not moving:
         raise BadInput("contains no video but a cover picture", where=path)
-    contexts = [stream.codec_context for stream in moving]
-    readable = [
-        one for one, context in zip(moving, contexts, strict=True) if context and context.codec
-    ]
+    readable = [one for one in moving if one.codec_context and one.codec_context.codec]
     if not readable:
         names = ", ".join(_codec_name(stream) for stream in moving)
         raise BadInput(
