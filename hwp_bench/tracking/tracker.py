@@ -15,8 +15,9 @@ import numpy as np
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.importers.shared.landmarks import HandTracks
-from hwp_bench.tracking.detection import (
+from hwp_bench.tracking.networks import (
     HAND_EDGE,
+    LiteRtNetworks,
     Region,
     SeenHand,
     cut_region,
@@ -26,7 +27,6 @@ from hwp_bench.tracking.detection import (
     place_in_image,
     suppress,
 )
-from hwp_bench.tracking.networks import LiteRtNetworks
 
 #: Two regions with more overlap than this show one hand.
 _SAME_REGION = 0.5

@@ -19,8 +19,7 @@ from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import DESCRIPTION, load_avatar
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
 from wildghand.fitting.session import Watch, fit_capture
-from wildghand.from_video.job import Job, VideoFit, with_quick
-from wildghand.from_video.run import JobRecord, Stage, run_stages
+from wildghand.from_video.run import Job, JobRecord, Stage, VideoFit, run_stages, with_quick
 from wildghand.from_video.stages import STAGES
 from wildghand.model.settings import read_settings
 

@@ -21,7 +21,7 @@ from hwp_bench.hands.template import boundary_vertices
 from hwp_bench.importers.shared.frames import CropWindows, cells, each_frame
 from hwp_bench.importers.shared.landmarks import Landmarks
 from hwp_bench.importers.video.model import ClipModel, PosedClip, pose_vertices
-from hwp_bench.importers.video.texture import sample
+from hwp_bench.importers.video.pictures import sample
 
 # --- Landmarks, motion, and what is known of hands
 

@@ -14,7 +14,8 @@ from hwp_bench.base.arrays import evenly
 from hwp_bench.base.console import notice
 from hwp_bench.base.errors import DidNotConverge
 from hwp_bench.hands import HandTemplate, load_template, pose_hand
-from hwp_bench.importers.shared.landmarks import LANDMARK_NAMES, SIDES, Landmarks
+from hwp_bench.hands.skeleton import SIDES
+from hwp_bench.importers.shared.landmarks import LANDMARK_NAMES, Landmarks
 from hwp_bench.importers.video.model import ClipModel, PosedClip, rigid_start
 from hwp_bench.importers.video.pictures import PictureResidual, SurfaceResidual
 from hwp_bench.importers.video.residuals import LandmarkResidual, OutlineResidual

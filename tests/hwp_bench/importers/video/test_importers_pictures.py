@@ -24,14 +24,18 @@ from painted_clip import (
 from hwp_bench.hands.raster import draw_faces, mix_corners
 from hwp_bench.importers.video.model import ClipModel, SurfaceMotion, frame_variables, pose_vertices
 from hwp_bench.importers.video.pictures import (
+    Atlas,
     Differences,
+    LitTexture,
     PictureResidual,
+    SeenTexels,
     TextureResidual,
     linearize,
+    sample,
+    smooth_within,
 )
 from hwp_bench.importers.video.residuals import OutlineResidual, signed_distance
 from hwp_bench.importers.video.solve import FittedClip, fit_outline, fit_picture
-from hwp_bench.importers.video.texture import Atlas, LitTexture, SeenTexels, sample, smooth_within
 
 
 def texture_of(fitted: FittedClip) -> TextureResidual:
