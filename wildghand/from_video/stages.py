@@ -1,5 +1,8 @@
 """The stages from a video to an avatar, those that show it, and the order of all."""
 
+# Methods of a stage are described where `Stage` declares them.
+# ruff: noqa: D102
+
 from __future__ import annotations
 
 import os
