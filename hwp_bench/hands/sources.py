@@ -59,11 +59,14 @@ def load_mano(path: str | os.PathLike[str], side: str) -> HandTemplate:
     faces = _dense(content, "f", (FACE_COUNT, 3), file).astype(np.int64)
     if faces.min() < 0 or faces.max() >= VERTEX_COUNT:
         raise BadHandModel("a face has a corner that is not a vertex", where=file, field="f")
-    shape_basis = _shape_basis(content, file)
-    if side == "left" and _needs_correction(shape_basis, file):
+    shape_basis = _dense(content, "shapedirs", (VERTEX_COUNT, 3, SHAPE_COUNT), file)
+    if side == "left" and not _is_corrected(shape_basis, file):
         shape_basis = shape_basis * np.array([-1.0, 1.0, 1.0])[:, None]
     regressor = _dense(content, "J_regressor", (JOINT_COUNT, VERTEX_COUNT), file)
-    _check_tree(content, file)
+    # The root's parent is -1 in an unsigned type.
+    tree = _dense(content, "kintree_table", (2, JOINT_COUNT), file)
+    if tuple(tree[0, 1:].astype(np.int64)) != PARENTS[1:]:
+        raise BadHandModel("is not MANO's joint tree", where=file, field="kintree_table")
     joints = regressor @ vertices
     uv, face_uv = two_chart_uv(vertices, faces, joints, side)
     return make_template(
@@ -138,24 +141,13 @@ def _read(file: Path) -> dict[str, Any]:
     return content
 
 
-def _shape_basis(content: dict[str, Any], file: Path) -> np.ndarray:
-    return _dense(content, "shapedirs", (VERTEX_COUNT, 3, SHAPE_COUNT), file)
-
-
-def _needs_correction(shape_basis: np.ndarray, left: Path) -> bool:
+def _is_corrected(shape_basis: np.ndarray, left: Path) -> bool:
     try:
         right = _find(left.parent, "right")
     except BadHandModel:
-        return True
-    other = _shape_basis(_read(right), right)
-    return bool(np.abs(shape_basis[:, 0] - other[:, 0]).sum() < _SAME_SHAPES_BELOW)
-
-
-def _check_tree(content: dict[str, Any], file: Path) -> None:
-    tree = _dense(content, "kintree_table", (2, JOINT_COUNT), file)
-    # The root's parent is -1 in an unsigned type.
-    if tuple(tree[0, 1:].astype(np.int64)) != PARENTS[1:]:
-        raise BadHandModel("is not MANO's joint tree", where=file, field="kintree_table")
+        return False
+    other = _dense(_read(right), "shapedirs", shape_basis.shape, right)
+    return bool(np.abs(shape_basis[:, 0] - other[:, 0]).sum() >= _SAME_SHAPES_BELOW)
 
 
 def _dense(content: dict[str, Any], field: str, shape: tuple[int, ...], file: Path) -> np.ndarray:
@@ -164,8 +156,11 @@ def _dense(content: dict[str, Any], field: str, shape: tuple[int, ...], file: Pa
         raise BadHandModel("is missing", where=file, field=field, remedy=_REMEDY)
     try:
         array = np.asarray(_unwrap(content[field]), dtype=np.float64)
-        # chumpy selections are stored flat.
-        array = array.reshape(shape) if array.ndim == 1 else _of_shape(array, shape)
+        if array.ndim == 1:
+            # chumpy selections are stored flat.
+            array = array.reshape(shape)
+        if array.shape != shape:
+            raise ValueError(f"its shape is {array.shape}")
     # An integer beyond the floats overflows.
     except (TypeError, ValueError, ArithmeticError, LookupError, RecursionError) as error:
         raise BadHandModel(
@@ -176,12 +171,6 @@ def _dense(content: dict[str, Any], field: str, shape: tuple[int, ...], file: Pa
         ) from error
     if not np.isfinite(array).all():
         raise BadHandModel("holds NaN or infinity", where=file, field=field, remedy=_REMEDY)
-    return array
-
-
-def _of_shape(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    if array.shape != shape:
-        raise ValueError(f"its shape is {array.shape}")
     return array
 
 

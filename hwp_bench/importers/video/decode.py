@@ -300,9 +300,18 @@ class _Video:
         self._stream.thread_type = "AUTO"
         aspect = float(self._stream.sample_aspect_ratio or 1)
         self._aspect = aspect if 1 / _MOST_ASPECT <= aspect <= _MOST_ASPECT else 1.0
-        self.fps = _rate(self._stream)
+        rates = [self._stream.average_rate, self._stream.guessed_rate, context.framerate]
+        if self._stream.time_base is not None and self._stream.time_base >= 1:
+            # Such a clock counts no frames.
+            rates = rates[2:]
+        #: Frames per second; 30 where the file states none that can be.
+        self.fps = next((float(rate) for rate in rates if rate and 0 < rate <= 1000), 30.0)
         self._packets, self._seconds, self._own = _expected(container, self._stream, kind)
-        self.stated: int = _stated_frames(self._stream, self._packets)
+        self.stated = int(self._stream.frames)
+        if self._packets is not None:
+            # An edit list may leave some out.
+            discarded = sum(entry.is_discard for entry in self._stream.index_entries)
+            self.stated = self._packets - discarded
         if self.stated <= 0 and self._seconds is not None:
             self.stated = max(0, min(round(self._seconds * self.fps), 2**31 - 1))
         # Half of a packet at the end, of a row of packets of one size.
@@ -347,17 +356,16 @@ class _Video:
                 return
             if packet.pts is not None and packet.size:
                 end = float((packet.pts + (packet.duration or 0)) * packet.time_base)
-                self._reached = max(self._reached, end - self._began(packet.stream))
+                # Less the second at which the time of the stream begins.
+                if self._own:
+                    began = float((packet.stream.start_time or 0) * packet.stream.time_base)
+                else:
+                    began = (self._container.start_time or 0) / _library().time_base
+                self._reached = max(self._reached, end - began)
             if packet.stream.index == own:
                 self._seen += packet.size > 0
                 self._damaged += bool(packet.is_corrupt)
                 yield packet
-
-    def _began(self, stream: Any) -> float:
-        """Second at which the time of a stream begins."""
-        if self._own:
-            return float((stream.start_time or 0) * stream.time_base)
-        return (self._container.start_time or 0) / _library().time_base
 
     def _colours(self, frame: Any) -> Colours:
         stated = (frame.colorspace, frame.color_primaries, frame.color_trc, frame.color_range)
@@ -389,10 +397,20 @@ class _Video:
         return width, height
 
     def _turned(self, frame: Any) -> tuple[bool, bool, bool]:
-        # Of the first frame only: one whose side data are looked at is part of a ring of objects,
-        # and stays in memory until Python looks for garbage.
+        """How a frame is turned for display: rows become columns, rows and columns reversed.
+
+        The display matrix maps a pixel's column and row to those of the display; the nearest of its
+        eight turns and mirror images is taken. It is that of the first frame: one whose side data
+        are looked at is part of a ring of objects, and stays in memory until Python looks for
+        garbage.
+        """
         if self._turn is None:
-            self._turn = _turn(frame)
+            self._turn = False, False, False
+            stated = next((s for s in frame.side_data if s.type.name == "DISPLAYMATRIX"), None)
+            if stated is not None:
+                a, b, _, c, d = (int(value) for value in np.frombuffer(stated, np.int32)[:5])
+                swapped = max(abs(b), abs(c)) > max(abs(a), abs(d))
+                self._turn = (True, b < 0, c < 0) if swapped else (False, d < 0, a < 0)
         return self._turn
 
     def upright_size(self, frame: Any) -> tuple[int, int]:
@@ -410,30 +428,6 @@ class _Video:
         return np.ascontiguousarray(image)
 
 
-def _turn(frame: Any) -> tuple[bool, bool, bool]:
-    """How a frame is turned for display: rows become columns, then rows and columns reversed.
-
-    The display matrix maps a pixel's column and row to those of the display; the nearest of its
-    eight turns and mirror images is taken.
-    """
-    stated = next((s for s in frame.side_data if s.type.name == "DISPLAYMATRIX"), None)
-    if stated is None:
-        return False, False, False
-    a, b, _, c, d = (int(value) for value in np.frombuffer(stated, dtype=np.int32)[:5])
-    if max(abs(b), abs(c)) > max(abs(a), abs(d)):
-        return True, b < 0, c < 0
-    return False, d < 0, a < 0
-
-
-def _rate(stream: Any) -> float:
-    """Frames per second; 30 where the file states none that can be."""
-    rates = [stream.average_rate, stream.guessed_rate, stream.codec_context.framerate]
-    if stream.time_base is not None and stream.time_base >= 1:
-        # Such a clock counts no frames.
-        rates = rates[2:]
-    return next((float(rate) for rate in rates if rate and 0 < rate <= 1000), 30.0)
-
-
 def _expected(container: Any, stream: Any, kind: str) -> tuple[int | None, float | None, bool]:
     """Read what a file says of its end."""
     if kind == "MP4 or MOV" and stream.frames > 0:
@@ -449,13 +443,6 @@ def _expected(container: Any, stream: Any, kind: str) -> tuple[int | None, float
     if container.duration and container.duration > 0:
         return None, container.duration / _library().time_base, False
     return None, None, True
-
-
-def _stated_frames(stream: Any, packets: int | None) -> int:
-    """Number of frames that a file lists; an edit list may leave some out."""
-    if packets is None:
-        return int(stream.frames)
-    return packets - sum(entry.is_discard for entry in stream.index_entries)
 
 
 def _choose(container: Any, path: Path) -> Any:

@@ -9,6 +9,7 @@ separate the colours on them from those around them better than any that lie els
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -198,8 +199,9 @@ def read_source(
     reading = endings[0] if endings else None
     if reading is not None:
         warn_of_damage(info, reading)
-    two = tracked is not None and len(hands) == 2
-    repaired = (tracked.swaps, tracked.doubles) if tracked is not None and two else (0, 0)
+    repaired = (0, 0)
+    if tracked is not None and len(hands) == 2:
+        repaired = (tracked.swaps, tracked.doubles)
     return VideoSource(
         info, Path(landmarks), indices, hands, windows, images, own, *repaired, reading
     )
@@ -362,13 +364,13 @@ def doubts_of_axes(landmarks: Landmarks, which: str = "`image` or `world`") -> l
         return float((image * (world @ np.array(axes, float).T)).sum(axis=(1, 2)).mean())
 
     as_given = alike(((1, 0), (0, 1)))
+    if as_given >= _UNLIKE:
+        return []
     scores = {name: alike(axes) for name, axes in _AXES.items()}
     best = max(scores, key=lambda name: scores[name])
-    if as_given < _UNLIKE and scores[best] > max(_ALIKE, as_given):
+    if scores[best] > max(_ALIKE, as_given):
         return [best.format(which)]
-    if as_given < _UNLIKE:
-        return ["`image` and `world` do not show the same hand in the same frames"]
-    return []
+    return ["`image` and `world` do not show the same hand in the same frames"]
 
 
 def _doubts_of_pictures(source: VideoSource, landmarks: Landmarks) -> tuple[list[str], bool]:
@@ -391,11 +393,17 @@ def _doubts_of_pictures(source: VideoSource, landmarks: Landmarks) -> tuple[list
     best = max(moved, key=lambda name: moved[name])
     if _clearly(moved[best], as_given, _BETTER):
         return [best], False
-    late = {
-        shift * sign: _separation_of_frames(pictures, landmarks, rows, shift * sign)
-        for shift in _SHIFTS
-        for sign in (1, -1)
-    }
+    late: dict[int, float] = {}
+    for shift in (sign * step for step in _SHIFTS for sign in (1, -1)):
+        # By the landmarks of later (or earlier) frames, where enough of them show the hand.
+        other = np.array(rows) + shift
+        good = (other >= 0) & (other < len(landmarks.detected))
+        good[good] &= landmarks.detected[other[good]]
+        if good.sum() >= max(len(rows) // 2, 3):
+            used = list(itertools.compress(pictures, good))
+            late[shift] = _separation(used, landmarks.image[other[good]])
+    if not late:
+        return [], as_given > _SEPARATED
     shift = max(late, key=lambda one: late[one])
     if _clearly(late[shift], as_given, _BETTER_SHIFT):
         frames = abs(shift) * int(np.diff(source.indices).min())
@@ -426,19 +434,6 @@ def _pictures(source: VideoSource, landmarks: Landmarks) -> tuple[list[int], lis
     return rows, pictures
 
 
-def _separation_of_frames(
-    pictures: Sequence[np.ndarray], landmarks: Landmarks, rows: Sequence[int], shift: int
-) -> float:
-    """Separation by the landmarks of later (or earlier) frames; 0 where too few are seen."""
-    other = np.array(rows) + shift
-    good = (other >= 0) & (other < len(landmarks.detected))
-    good[good] &= landmarks.detected[other[good]]
-    if good.sum() < max(len(rows) // 2, 3):
-        return 0.0
-    used = [picture for picture, one in zip(pictures, good, strict=True) if one]
-    return _separation(used, landmarks.image[other[good]])
-
-
 def _separation(pictures: Sequence[np.ndarray], points: np.ndarray) -> float:
     """How well a line through colours tells those on (F, 21, 2) px from those around them.
 
@@ -450,11 +445,8 @@ def _separation(pictures: Sequence[np.ndarray], points: np.ndarray) -> float:
         along = np.linspace(0.0, 1.0, _ALONG)[:, None, None]
         on = (hand[_BONES[:, 0]] * (1.0 - along) + hand[_BONES[:, 1]] * along).reshape(-1, 2)
         size = np.ptp(hand, axis=0).max()
-        sides = [
-            np.linspace(hand[:, axis].min() - 0.45 * size, hand[:, axis].max() + 0.45 * size, n)
-            for axis, n in ((0, _AROUND), (1, _AROUND))
-        ]
-        grid = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
+        low, high = hand.min(axis=0) - 0.45 * size, hand.max(axis=0) + 0.45 * size
+        grid = np.stack(np.meshgrid(*np.linspace(low, high, _AROUND).T), axis=-1).reshape(-1, 2)
         apart = np.linalg.norm(grid[:, None] - on[None], axis=-1).min(axis=1)
         hand_colors, share = _colors(picture, on)
         others, _ = _colors(picture, grid[apart > 0.18 * size])
