@@ -30,8 +30,7 @@ from hwp_bench.importers.shared.landmarks import read_hand_tracks, write_hand_tr
 from hwp_bench.tracking.networks import HAND, PALM, models_folder
 from wildghand.avatar.files import load_avatar
 from wildghand.cli.main import main
-from wildghand.from_video import VideoFit, make_avatar
-from wildghand.from_video import stages
+from wildghand.from_video import VideoFit, make_avatar, stages
 from wildghand.from_video.run import QUICK as QUICK_CHANGES
 from wildghand.from_video.run import QUICK_FRAMES, Job, with_quick
 from wildghand.from_video.stages import STAGES, import_options, stride
