@@ -190,4 +190,6 @@ def test_the_command_writes_a_mesh_and_names_what_is_wrong(
 
 def test_truth_must_be_known(make_capture: CaptureMaker) -> None:
     with pytest.raises(UsageError, match="does not know the true"):
-        hand_meshes(make_capture(frames=10), 0, truth=True)
+        hand_meshes(make_capture("a", frames=10), 0, truth=True)
+    known = make_capture("b", frames=10, truth=True)
+    assert np.isfinite(hand_meshes(known, 0, truth=True)["right"].vertices).all()
