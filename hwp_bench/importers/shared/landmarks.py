@@ -227,7 +227,7 @@ def associate(tracks: HandTracks) -> Association:
         name: np.where(crossed.reshape(-1, *[1] * (rows.ndim - 2)), rows[::-1], rows)
         for name, rows in replace(tracks, score=score).arrays.items()
     }
-    return Association(replace(tracks, **exchanged), swaps, len(double))
+    return Association(HandTracks(**exchanged, size=tracks.size), swaps, len(double))
 
 
 def _crossed(tracks: HandTracks, seen: np.ndarray, size: float) -> np.ndarray:
