@@ -26,7 +26,6 @@ from hwp_bench.capture.schema import (
     Cameras,
     CaptureInfo,
     arrays_digest,
-    check_id,
     hand_arrays,
     image_path,
     numbers_digests,
@@ -66,7 +65,6 @@ class CaptureWriter:
     ) -> None:
         self.path = Path(path)
         self.info = CaptureInfo.from_json(info.to_json(), where=os.fspath(path))
-        check_id(info.id, os.fspath(path))
         self._check_hands(hands)
         if len(cameras) != info.frame_count:
             raise BadCapture(
@@ -144,39 +142,27 @@ class CaptureWriter:
                 field=f"{kind}[{frame}]",
             )
         if not 0 <= frame < self.info.frame_count:
-            raise BadCapture(
-                f"frame {frame} is not among the {self.info.frame_count} frames",
-                where=self.path,
-                field=kind,
-            )
+            said = f"frame {frame} is not among the {self.info.frame_count} frames"
+            raise BadCapture(said, where=self.path, field=kind)
         write_image(image_path(self._root, kind, frame), pixels)
         self._digests.setdefault(kind, {})[frame] = pixel_digest(pixels)
 
     def _check_hands(self, hands: Mapping[str, HandParameters]) -> None:
         if set(hands) != set(self.info.sides):
-            raise BadCapture(
-                f"parameters of {sorted(hands)} for a capture of {list(self.info.sides)}",
-                where=self.path,
-                field="hands",
-            )
+            said = f"parameters of {sorted(hands)} for a capture of {list(self.info.sides)}"
+            raise BadCapture(said, where=self.path, field="hands")
         for side, parameters in hands.items():
             if len(parameters.pose) != self.info.frame_count:
-                raise BadCapture(
-                    f"{len(parameters.pose)} poses for {self.info.frame_count} frames",
-                    where=self.path,
-                    field=f"hands.{side}",
-                )
+                said = f"{len(parameters.pose)} poses for {self.info.frame_count} frames"
+                raise BadCapture(said, where=self.path, field=f"hands.{side}")
 
     def _finish(self) -> None:
         count = self.info.frame_count
         for kind in {"frames", "masks", *self._digests}:
             missing = set(range(count)) - set(self._digests.get(kind, {}))
             if missing:
-                raise BadCapture(
-                    f"{len(missing)} of {count} images were not given (first: {min(missing)})",
-                    where=self.path,
-                    field=kind,
-                )
+                said = f"{len(missing)} of {count} images were not given (first: {min(missing)})"
+                raise BadCapture(said, where=self.path, field=kind)
         digests = {
             kind: combine(by_frame[frame] for frame in range(count))
             for kind, by_frame in self._digests.items()

