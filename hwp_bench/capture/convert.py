@@ -15,7 +15,7 @@ from hwp_bench.base.files import atomic_write
 from hwp_bench.capture.reader import Capture, identify_hand_model
 from hwp_bench.capture.writer import rewrite_capture
 from hwp_bench.hands.anchors import to_trimesh
-from hwp_bench.hands.fitting import FitTargets, FittingSettings, fit_hand
+from hwp_bench.hands.fitting import FitTargets, fit_hand
 from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.hands.skinning import pose_hand, pose_parameters
 from hwp_bench.hands.sources import load_template
@@ -39,10 +39,7 @@ class ConversionError:
 
 
 def convert_hand(
-    hand: HandParameters,
-    source: HandTemplate,
-    target: HandTemplate,
-    settings: FittingSettings | None = None,
+    hand: HandParameters, source: HandTemplate, target: HandTemplate
 ) -> tuple[HandParameters, ConversionError]:
     """Express a hand in another hand model."""
     if source.side != target.side:
@@ -54,7 +51,7 @@ def convert_hand(
     start = replace(unshaped, transl=hand.transl + shift)
     step = max(1, len(source.vertices) // SKIN_POINTS)
     targets = FitTargets(posed.landmarks.numpy(), skin=posed.vertices[:, ::step].numpy())
-    fitted = fit_hand(target, targets, start, settings)
+    fitted = fit_hand(target, targets, start)
     return fitted.parameters, ConversionError(
         landmark_mm=float(np.nanmean(fitted.landmark_mm)),
         skin_mm=float(np.nanmean(fitted.skin_mm)),
@@ -99,19 +96,14 @@ def with_one_shape(
 
 
 def convert_capture(
-    capture: Capture,
-    out: str | os.PathLike[str],
-    source: str,
-    *,
-    overwrite: bool = False,
-    settings: FittingSettings | None = None,
+    capture: Capture, out: str | os.PathLike[str], source: str, *, overwrite: bool = False
 ) -> dict[str, ConversionError]:
     """Write a capture again with its hands in another hand model; images stay as they are."""
     info = capture.info
     made, errors = {}, {}
     for side, hand in capture.hands.items():
         target = load_template(source, side)
-        made[side], errors[side] = convert_hand(hand, capture.template(side), target, settings)
+        made[side], errors[side] = convert_hand(hand, capture.template(side), target)
     note = {side: vars(error) for side, error in errors.items()}
     changed = replace(
         info,

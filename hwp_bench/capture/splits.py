@@ -250,11 +250,7 @@ class AuditReport:
 
 
 def audit_split(
-    capture: Capture,
-    split: Split,
-    *,
-    threshold: float = NEAR_DUPLICATE_RMS,
-    bits: int = SAME_IMAGE_BITS,
+    capture: Capture, split: Split, *, threshold: float = NEAR_DUPLICATE_RMS
 ) -> AuditReport:
     """Audit the split of a capture.
 
@@ -271,7 +267,7 @@ def audit_split(
         if values is not None and values[frame] > 0
     ]
     duplicates = _near_duplicates(capture, split, threshold)
-    hashes = _same_hashes(capture, split, bits)
+    hashes = _same_hashes(capture, split)
     return AuditReport(
         capture=capture.info.id,
         counts={part: len(frames) for part, frames in parts.items()},
@@ -303,7 +299,7 @@ def _features(
     return others, test, seen
 
 
-def _same_hashes(capture: Capture, split: Split, bits: int) -> tuple[tuple[int, int, int], ...]:
+def _same_hashes(capture: Capture, split: Split) -> tuple[tuple[int, int, int], ...]:
     """Pairs of frames with nearly one perceptual hash (OpenCV's PHash, 64 bits)."""
     import cv2
 
@@ -314,7 +310,7 @@ def _same_hashes(capture: Capture, split: Split, bits: int) -> tuple[tuple[int, 
     others, test, seen = _features(capture, split, hashed)
     # Bits that differ: |a| + |b| - 2 a.b for vectors of zeros and ones.
     distance = test.sum(1)[:, None] + seen.sum(1)[None] - 2 * test @ seen.T
-    rows, columns = np.nonzero(distance <= bits)
+    rows, columns = np.nonzero(distance <= SAME_IMAGE_BITS)
     found = (split.test[rows], others[columns], distance[rows, columns])
     return tuple(zip(*(values.tolist() for values in found), strict=True))
 

@@ -91,8 +91,12 @@ def sample_surface(
     face_index = np.repeat(np.arange(len(areas)), shares)
     position = np.arange(count) - np.repeat(bounds - shares, shares)
     start = random.uniform(size=(len(areas), 2))[face_index]
-    square = (start + position[:, None] * _R2_STEP) % 1.0
-    return SurfaceAnchors(face_index, _square_to_triangle(square))
+    x, y = ((start + position[:, None] * _R2_STEP) % 1.0).T
+    upper = y > x
+    first = np.where(upper, 0.5 * x, x - 0.5 * y)
+    second = np.where(upper, y - 0.5 * x, 0.5 * y)
+    mix = np.stack([first, second, 1.0 - first - second], axis=1)
+    return SurfaceAnchors(face_index, mix)
 
 
 def anchor_positions(
@@ -181,14 +185,6 @@ def to_trimesh(vertices: torch.Tensor | np.ndarray, faces: Any) -> trimesh.Trime
     if isinstance(vertices, torch.Tensor):
         vertices = vertices.detach().cpu().numpy()
     return trimesh.Trimesh(np.asarray(vertices), np.asarray(faces), process=False)
-
-
-def _square_to_triangle(square: np.ndarray) -> np.ndarray:
-    x, y = square.T
-    upper = y > x
-    first = np.where(upper, 0.5 * x, x - 0.5 * y)
-    second = np.where(upper, y - 0.5 * x, 0.5 * y)
-    return np.stack([first, second, 1.0 - first - second], axis=1)
 
 
 def _gather(

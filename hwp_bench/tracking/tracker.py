@@ -88,8 +88,13 @@ class HandTracker:
             moved = np.inf if before is None else _distance(hand, before.hand)
             track = -1 if before is None else before.track
             seen.append((TrackedHand(track, hand), moved))
-        found = _without_doubles(seen)[: self._settings.hands]
-        self._followed = [self._numbered(hand) for hand in found]
+        self._followed = []
+        for one in _without_doubles(seen)[: self._settings.hands]:
+            number = one.track
+            if number < 0:
+                # A new track.
+                number, self._tracks = self._tracks, self._tracks + 1
+            self._followed.append(TrackedHand(number, one.hand))
         return list(self._followed)
 
     def _regions(self, frame: np.ndarray) -> list[tuple[Region, TrackedHand | None]]:
@@ -112,13 +117,6 @@ class HandTracker:
         palms = suppress(decode(values, logits, self._settings.min_palm_score))
         regions = [place_in_image(palm, width, height).hand_region() for palm in palms]
         return [region for region in regions[: self._settings.hands] if _is_sound(region, frame)]
-
-    def _numbered(self, hand: TrackedHand) -> TrackedHand:
-        """The hand, with a new track if it has none."""
-        if hand.track >= 0:
-            return hand
-        self._tracks += 1
-        return TrackedHand(self._tracks - 1, hand.hand)
 
 
 def _without_doubles(seen: list[tuple[TrackedHand, float]]) -> list[TrackedHand]:
@@ -226,7 +224,10 @@ def _owners(frame: np.ndarray, track: np.ndarray, right: np.ndarray, most: int) 
     lengths = [sum(len(one.frames) for one in side) for side in sides]
     first, second = sides if lengths[0] >= lengths[1] else sides[::-1]
     if most == 1 or min(lengths) < _SECOND_HAND * max(lengths):
-        first, second = _joined(first, second), []
+        # Tracks of the second fill frames in which the first is not seen.
+        taken = {frame for one in first for frame in one.frames.tolist()}
+        spare = [one for one in second if taken.isdisjoint(one.frames.tolist())]
+        first, second = [*first, *spare], []
     owner = np.full(len(frame), -1)
     for hand, side in enumerate((first, second)):
         for one in side:
@@ -250,9 +251,3 @@ def _by_side(tracks: list[_Track]) -> tuple[list[_Track], list[_Track]]:
                 taken[side].update(frames)
                 break
     return sides
-
-
-def _joined(first: list[_Track], second: list[_Track]) -> list[_Track]:
-    """One hand of two sides: tracks of the second fill frames in which the first is not seen."""
-    taken = {frame for one in first for frame in one.frames.tolist()}
-    return [*first, *(one for one in second if taken.isdisjoint(one.frames.tolist()))]
