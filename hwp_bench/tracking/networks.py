@@ -533,7 +533,7 @@ def _download(wheel: Pinned, target: IO[bytes], opener: Opener) -> None:
 class LiteRtNetworks:
     """MediaPipe's networks: they find palms, and the landmarks of a hand."""
 
-    def __init__(self, models: HandModels, *, threads: int = 1) -> None:
+    def __init__(self, models: HandModels) -> None:
         try:
             runtime: Any = importlib.import_module("ai_edge_litert.interpreter")
         except ImportError as error:
@@ -543,8 +543,8 @@ class LiteRtNetworks:
             ) from error
         palm_outputs: list[tuple[int, ...]] = [(1, ANCHOR_COUNT, PALM_VALUES), (1, ANCHOR_COUNT, 1)]
         hand_outputs: list[tuple[int, ...]] = [(1, 63), (1, 1), (1, 1), (1, 63)]
-        self._palm = _Network(runtime, models.palm, models.source, PALM_EDGE, palm_outputs, threads)
-        self._hand = _Network(runtime, models.hand, models.source, HAND_EDGE, hand_outputs, threads)
+        self._palm = _Network(runtime, models.palm, models.source, PALM_EDGE, palm_outputs)
+        self._hand = _Network(runtime, models.hand, models.source, HAND_EDGE, hand_outputs)
 
     def palms(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Find palms in (192, 192, 3) uint8 RGB.
@@ -572,11 +572,10 @@ class _Network:
         source: str,
         edge: int,
         outputs: list[tuple[int, ...]],
-        threads: int,
     ) -> None:
         try:
             with _silent():
-                self._run = runtime.Interpreter(model_content=content, num_threads=threads)
+                self._run = runtime.Interpreter(model_content=content, num_threads=1)
                 self._run.allocate_tensors()
             (given,), results = self._run.get_input_details(), self._run.get_output_details()
             # Their order in the file is not fixed; their names count up.

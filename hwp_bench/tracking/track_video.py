@@ -85,8 +85,7 @@ def track_video(
 
     Args:
         video: any file that `hwp_bench.importers.video.decode` reads, not mirrored.
-        out: `.npz` to write (`hand_tracks` describes it); the importer reads it.
-        settings: thresholds; the defaults where None.
+        out: `.npz` to write; the importer reads it.
         model: file or folder of the networks; None takes the cache, or downloads them once.
         overwrite: replace an existing file.
         networks: to run in place of the model.
@@ -144,23 +143,20 @@ def track_frames(
 
 #: Colours of a right and a left hand.
 COLOURS = {"right": (255, 160, 0), "left": (60, 200, 255)}
-#: Frames in a row of the sheet.
-_COLUMNS = 4
+# Frames on the sheet and in a row of it, and the longer side of each, px.
+_COUNT, _COLUMNS, _EDGE = 16, 4, 320
 
 
-def landmark_sheet(tracked: TrackedVideo, *, count: int = 16, edge: int = 320) -> np.ndarray:
-    """Draw `count` frames, evenly spaced over a video, with their hands: (H, W, 3) uint8.
-
-    `edge` is the longer side of each frame, px.
-    """
+def landmark_sheet(tracked: TrackedVideo) -> np.ndarray:
+    """Draw frames, evenly spaced over a video, with their hands: (H, W, 3) uint8."""
     frames = tracked.hands.score.shape[1]
-    stride = -(-frames // count)
+    stride = -(-frames // _COUNT)
     left, top, right, bottom = _window(tracked.hands)
     tiles: list[np.ndarray] = []
     for index, frame in read_frames(tracked.video, FrameRange(stride=stride)):
-        if index < frames and len(tiles) < count:
+        if index < frames and len(tiles) < _COUNT:
             part = np.ascontiguousarray(frame[top:bottom, left:right])
-            scale = edge / max(part.shape[:2])
+            scale = _EDGE / max(part.shape[:2])
             part = cv2.resize(part, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
             _draw_landmarks(part, tracked.hands, index, (left, top), scale)
             tiles.append(labelled(part, str(index)))

@@ -60,15 +60,13 @@ class ColourModel:
         return ColourModel(background, foreground)
 
 
-def learn_colours(
-    samples: Iterable[tuple[np.ndarray, np.ndarray]], seed: int = 0
-) -> ColourModel | None:
+def learn_colours(samples: Iterable[tuple[np.ndarray, np.ndarray]]) -> ColourModel | None:
     """Learn the mixtures; None where hand or surroundings have fewer than 100 pixels.
 
     `samples` are, for each frame, colours (N, 3) uint8 of pixels that are hand, and of those that
     are not.
     """
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(0)
     kinds: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     for sample in samples:
         for pixels, found in zip(kinds, sample, strict=True):
@@ -77,7 +75,7 @@ def learn_colours(
     hand, other = (np.concatenate([np.zeros((0, 3), np.uint8), *pixels]) for pixels in kinds)
     if min(len(hand), len(other)) < 100:
         return None
-    cv2.setRNGSeed(seed)
+    cv2.setRNGSeed(0)
     model = _mixtures(hand, other, random)
     # The silhouette also covers objects in the hand. Colours that also occur next to the hand
     # are therefore not learnt as hand. (A hand before skin-coloured things is not harmed.)
