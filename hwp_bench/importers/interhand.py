@@ -398,14 +398,7 @@ def import_interhand(
     hands: dict[str, HandParameters] = {}
     errors: dict[str, dict[str, Any]] = {}
     for side, template in templates.items():
-        errors[side] = {}
-        if options.mano is not None:
-            hands[side], one_shape = _mano_hand(records.mano[side], template, side, root)
-            errors[side] = {"one_shape_mm": round(float(np.nanmean(one_shape)), 3)}
-        else:
-            hands[side] = _free_hand(records, template, side, root)
-        distance = _joint_distance(records.joints[side], template, hands[side])
-        errors[side] |= {"joints_mm": distance, "frames_valid": int(hands[side].valid.sum())}
+        hands[side], errors[side] = _import_hand(records, template, options, root)
     viewmats = np.tile(records.viewmat, (count, 1, 1))
 
     def projected(Ks: np.ndarray) -> list[ProjectedHand]:
@@ -465,45 +458,42 @@ def _without_black_frames(
     return records.select(kept), black
 
 
-def _no_annotation(what: str, side: str, root: str | os.PathLike[str]) -> BadInput:
-    other = "left" if side == "right" else "right"
-    return BadInput(
-        f"the {side} hand has no {what} in any frame",
-        where=root,
-        remedy=f"Import the other hand alone: --side {other}.",
-    )
-
-
-def _mano_hand(
-    mano: ManoAnnotation, template: HandTemplate, side: str, root: str | os.PathLike[str]
-) -> tuple[HandParameters, np.ndarray]:
-    """MANO as annotated: relative to the mean pose, each hand with its own model."""
-    if not mano.valid.any():
-        raise _no_annotation("MANO parameters", side, root)
-    pose = mano.pose.copy()
-    pose[:, 1:] += template.mean_pose.reshape(15, 3)
-    return with_one_shape(template, pose, mano.shape, mano.transl, mano.valid)
-
-
-def _free_hand(
-    records: InterHandRecords, template: HandTemplate, side: str, root: str | os.PathLike[str]
-) -> HandParameters:
-    joints = records.joints[side]
-    # A hand is placed by its wrist and knuckles; without them it cannot be placed.
-    valid = np.isfinite(joints[:, [0, 5, 9, 17]]).all(axis=(1, 2))
+def _import_hand(
+    records: InterHandRecords,
+    template: HandTemplate,
+    options: InterHandImport,
+    root: str | os.PathLike[str],
+) -> tuple[HandParameters, dict[str, Any]]:
+    """Take MANO over as annotated, or fit the free hand to the joints; with its errors."""
+    side = template.side
+    mano, joints = records.mano[side], records.joints[side]
+    what, valid = "MANO parameters", mano.valid
+    if options.mano is None:
+        # A hand is placed by its wrist and knuckles; without them it cannot be placed.
+        what, valid = "joints", np.isfinite(joints[:, [0, 5, 9, 17]]).all(axis=(1, 2))
     if not valid.any():
-        raise _no_annotation("joints", side, root)
-    mano = records.mano[side]
-    pose = np.where(mano.valid[:, None, None], mano.pose, 0.0)
-    return fit_free_hand(template, pose, valid, joints[:, 9], FitTargets(joints)).parameters
-
-
-def _joint_distance(
-    joints: np.ndarray, template: HandTemplate, hand: HandParameters
-) -> float | None:
+        other = "left" if side == "right" else "right"
+        raise BadInput(
+            f"the {side} hand has no {what} in any frame",
+            where=root,
+            remedy=f"Import the other hand alone: --side {other}.",
+        )
+    errors = {}
+    if options.mano is not None:
+        # Relative to the mean pose, each hand with its own model.
+        pose = mano.pose.copy()
+        pose[:, 1:] += template.mean_pose.reshape(15, 3)
+        hand, one_shape = with_one_shape(template, pose, mano.shape, mano.transl, valid)
+        errors["one_shape_mm"] = round(float(np.nanmean(one_shape)), 3)
+    else:
+        pose = np.where(mano.valid[:, None, None], mano.pose, 0.0)
+        targets = FitTargets(joints)
+        hand = fit_free_hand(template, pose, valid, joints[:, 9], targets).parameters
     posed = pose_parameters(template, hand).landmarks.numpy()
     gaps = np.linalg.norm(posed - joints, axis=-1)[hand.valid]
-    return round(1000.0 * float(np.nanmean(gaps)), 3) if np.isfinite(gaps).any() else None
+    known = np.isfinite(gaps).any()
+    distance = round(1000.0 * float(np.nanmean(gaps)), 3) if known else None
+    return hand, {**errors, "joints_mm": distance, "frames_valid": int(hand.valid.sum())}
 
 
 def _windows(clips: list[ProjectedHand], options: InterHandImport) -> CropWindows:

@@ -24,7 +24,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -48,7 +47,7 @@ from hwp_bench.importers.official.records import (
     SideRecords,
     read_records,
 )
-from hwp_bench.importers.shared.frames import cells, cut, resample
+from hwp_bench.importers.shared.frames import cells, cut, each_frame, resample
 from hwp_bench.importers.shared.output import (
     ProjectedHand,
     ReleaseImport,
@@ -115,27 +114,13 @@ def crop_frames(
         return cropped, (width / 2.0, height / 2.0)
 
     count = len(records.images)
-    with ThreadPoolExecutor(4) as pool, progress("cropping frames", count) as update:
-        crops, centres = [], []
-        for done, (crop, centre) in enumerate(pool.map(one, range(count)), start=1):
-            crops.append(crop)
+    crops, centres = [], []
+    with progress("cropping frames", count) as update:
+        for cropped, centre in each_frame(one, range(count)):
+            crops.append(cropped)
             centres.append(centre)
-            update(done)
+            update(len(crops))
     return crops, np.array(centres)
-
-
-def tracked_joints(
-    records: OfficialRecords, sides: tuple[str, ...], crops: list[CroppedFrame], size: int
-) -> np.ndarray:
-    """Return the tracker's joints in the crops: (F, 21 * sides, 2) px, NaN where not valid."""
-    corners = np.array([crop.corner for crop in crops], dtype=np.float64)
-    scales = size / np.array([crop.side for crop in crops], dtype=np.float64)
-    points = []
-    for side in sides:
-        hand = records.sides[side]
-        moved = (hand.landmarks - corners[:, None]) * scales[:, None, None]
-        points.append(np.where(hand.valid[:, None, None], moved, np.nan))
-    return np.concatenate(points, axis=1)
 
 
 def box_of_landmarks(landmarks: np.ndarray) -> np.ndarray:
@@ -153,12 +138,8 @@ def correct_crop(
 ) -> CroppedFrame:
     """Cut the smallest square of whole pixels about a box, black outside the image.
 
-    Args:
-        image: (H, W, 3) uint8.
-        mask: (H, W) uint8 as stored.
-        box: (4,) x1, y1, x2, y2, px.
-        focal: px of the whole frame; the principal point is its centre.
-        size: edge of the crop after resampling (by area), px.
+    The box is x1, y1, x2, y2, px; the focal length that of the whole frame, px, whose centre is the
+    principal point. Crops are resampled, by area, to `size` px.
     """
     height, width = image.shape[:2]
     box = np.asarray(box, dtype=np.float64)
@@ -180,10 +161,7 @@ def correct_crop(
 def official_crop(
     image: np.ndarray, mask: np.ndarray, box: np.ndarray, focal: float, size: int
 ) -> CroppedFrame:
-    """Crop as the released loader does; the top of the module lists its mistakes.
-
-    Arguments as of `correct_crop`; of `box` the type matters, as in the loader.
-    """
+    """Crop as the released loader does; of the box the type matters, as in the loader."""
     import cv2
 
     height, width = image.shape[:2]
@@ -275,7 +253,20 @@ def import_official(
         side: project_hand(load_template(options.model, side), made.hand, cameras)
         for side, made in hands.items()
     }
-    tracked = tracked_joints(records, sides, crops, options.size)
+    # The tracker's joints in the crops: (F, 21 * sides, 2) px, NaN where not valid.
+    corners = np.array([crop.corner for crop in crops], dtype=np.float64)
+    scales = options.size / np.array([crop.side for crop in crops], dtype=np.float64)
+    tracked = np.concatenate(
+        [
+            np.where(
+                records.sides[side].valid[:, None, None],
+                (records.sides[side].landmarks - corners[:, None]) * scales[:, None, None],
+                np.nan,
+            )
+            for side in sides
+        ],
+        axis=1,
+    )
     facts = _facts(folder, records, hands, clips, tracked, crops, warnings, options)
     entry = catalogue().get(folder.id)
     write_capture(
