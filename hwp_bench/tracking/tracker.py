@@ -183,9 +183,9 @@ class Collected:
     def add(self, hands: Sequence[TrackedHand]) -> None:
         """Take the hands of the next frame."""
         for one in hands:
-            points = (part.astype(np.float32) for part in (one.hand.image, one.hand.world))
-            row = (self.frames, one.track, *points, one.hand.presence, one.hand.right)
-            self._rows.append(row)
+            image, world = one.hand.image.astype(np.float32), one.hand.world.astype(np.float32)
+            scores = (one.hand.presence, one.hand.right)
+            self._rows.append((self.frames, one.track, image, world, *scores))
         self.frames += 1
 
     def hands(self, size: tuple[int, int], most: int) -> HandTracks | None:
