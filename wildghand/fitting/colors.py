@@ -242,8 +242,7 @@ def tint_share(off: Tensor) -> Tensor:
 def _lit(model: WildGHandModel, normals: Tensor, dark: Tensor | None) -> Tensor:
     """(B, N, 1) factors of light and shadows on colours of (B, N) places."""
     lit = torch.ones_like(normals[..., 0]) if dark is None else dark
-    shading = None if model.shadows is None else model.shadows.shading(normals)
-    return (lit if shading is None else lit * shading)[..., None]
+    return (lit if model.shadows is None else lit * model.shadows.shading(normals))[..., None]
 
 
 def _logits(colors: Tensor) -> Tensor:

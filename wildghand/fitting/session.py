@@ -167,7 +167,7 @@ def _fit_in(
     save: bool = True,
 ) -> WildGHandAvatar:
     """Fit, from the state that is saved in the work folder if there is one."""
-    training = affordable(open_request(work / "request"), chosen, run.budget)
+    training = affordable(open_request(work / "request"), run.budget)
     digest = sha256_json(
         [sha256_file(work / "request" / REQUEST), capture.info.to_json().get("digests")]
     )

@@ -8,17 +8,15 @@ from wildghand.light.fit_lights import (
     fit_light,
 )
 from wildghand.light.hand_shadows import HandShadows, Obstacles, ShadowTable, obstacles_in_frames
-from wildghand.light.lights import CastLight, LightSettings, ShadowSettings
+from wildghand.light.lights import CastLight
 
 __all__ = [
     "CastLight",
     "HandShadows",
     "KnownLight",
     "LightSamples",
-    "LightSettings",
     "Obstacles",
     "ShadowSamples",
-    "ShadowSettings",
     "ShadowTable",
     "find_light",
     "fit_light",

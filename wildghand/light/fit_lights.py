@@ -33,7 +33,6 @@ from wildghand.gaussians.found import Found, Kept
 from wildghand.light.lights import (
     SRGB,
     CastLight,
-    ShadowSettings,
     ring_around,
     spread_directions,
 )
@@ -186,6 +185,8 @@ def _real(values: np.ndarray | float) -> Tensor:
 
 # Of `find_light`. Directions among which a lamp is sought, as far apart as lamps are told apart.
 _CANDIDATES = 162
+#: Lamps at most.
+LAMPS = 4
 # Share of the misfit that a further lamp must take away; less is noise (docs/person.md).
 _LEAST_GAIN = 0.006
 #: Directions of the sky from which the walls shine; they come after those of the lamps.
@@ -243,16 +244,16 @@ class _Solved:
 
 
 def find_light(
-    samples: ShadowSamples, settings: ShadowSettings, *, softness: float = 12.0
+    samples: ShadowSamples, *, lamps: int = LAMPS, softness: float = 12.0
 ) -> CastLight | None:
     """Find a light; nothing is random. None where there are too few samples.
 
     Args:
         samples: of one clip, of both hands together where there are two.
-        settings: how many lamps.
+        lamps: at most.
         softness: half the angle over which a lamp is spread, degrees: poses are not exact.
     """
-    most = 1 + len(_WALLS) + settings.lamps
+    most = 1 + len(_WALLS) + lamps
     if len(samples.places) < _SAMPLES_EACH * most or not samples.weights.sum() > 0.0:
         return None
     pursuit = _Pursuit(samples)
@@ -263,16 +264,16 @@ def find_light(
     solved = pursuit.solve(basis)
     candidates = spread_directions(_CANDIDATES)
     falling = samples.falling(candidates)
-    lamps: list[np.ndarray] = []
-    while len(lamps) < settings.lamps:
-        lamp, column = pursuit.next_lamp(candidates, falling, lamps, solved)
+    found: list[np.ndarray] = []
+    while len(found) < lamps:
+        lamp, column = pursuit.next_lamp(candidates, falling, found, solved)
         wider = np.column_stack([basis, column])
         trial = pursuit.solve(wider)
         if trial.misfit > solved.misfit * (1.0 - _LEAST_GAIN):
             break
-        lamps.append(lamp)
+        found.append(lamp)
         basis, solved = wider, trial
-    return _light_of(solved.strengths, lamps, sky, shares, softness)
+    return _light_of(solved.strengths, found, sky, shares, softness)
 
 
 class _Pursuit:

@@ -8,37 +8,7 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from hwp_bench.methods.settings import number
 from wildghand.gaussians.found import Found, Kept
-
-
-@dataclass(frozen=True)
-class LightSettings:
-    """How light is carried on beyond the normals of a clip."""
-
-    #: Fit a light at the end of a fit, and draw unknown normals by it.
-    enabled: bool = True
-    #: Samples from which the light is fitted, at most: more change nothing, and take time.
-    samples: ClassVar[int] = 40_000
-
-
-@dataclass(frozen=True)
-class ShadowSettings:
-    """How the light that casts shadows is found, and how hands are drawn in it."""
-
-    #: Find a light before the first step, and darken Gaussians that the hands keep it from.
-    enabled: bool = True
-    #: Lamps at most.
-    lamps: int = number(4, 0, 32)
-    #: The light also says how bright a normal is with nothing in the way; the network says what is
-    #: left. Else the network alone does.
-    shading: bool = True
-
-    #: Frames that are read at most, spread over the clip, and places on each hand: rays to all
-    #: candidate lamps take a second.
-    frames: ClassVar[int] = 96
-    places: ClassVar[int] = 400
-
 
 #: Share of the light that is left in the darkest shadow: skin around a place lights it too.
 DARKEST = 0.15

@@ -22,7 +22,7 @@ from wildghand.gaussians.found import Found
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import AnchorPoses, HandRig, rig_of
 from wildghand.gaussians.training import TrainingClip
-from wildghand.light import CastLight, HandShadows, KnownLight, ShadowSettings
+from wildghand.light import CastLight, HandShadows, KnownLight
 from wildghand.light.hand_shadows import Hand, Hands
 from wildghand.model.dress import Gaussians, dress
 from wildghand.model.frames import HandState, RenderedFrames, largest, rasterize_hands, relit
@@ -72,7 +72,6 @@ class WildGHandModel(nn.Module):
         embedding: width of the temporal embedding.
         rank: of the field of biases; 0: none.
         template: apply the network's displacement of the template (head iii).
-        shadows: how hands are drawn in the light that casts shadows, once there is one.
 
     Attributes:
         log_gains: (R, 3) log of the gain on the sRGB image of each frame.
@@ -96,10 +95,8 @@ class WildGHandModel(nn.Module):
         embedding: int = 256,
         rank: int = 0,
         template: bool = True,
-        shadows: ShadowSettings | None = None,
     ) -> None:
         super().__init__()
-        self._shadow_settings = shadows or ShadowSettings()
         self.shadows: HandShadows | None = None
         self._template = template
         self.light: KnownLight | None = None
@@ -127,7 +124,7 @@ class WildGHandModel(nn.Module):
             self.register_buffer(name, values.to(device))
         held: Any = found.to(device)
         if isinstance(held, CastLight):
-            held = HandShadows(self.rigs, held, self._shadow_settings)
+            held = HandShadows(self.rigs, held)
         if isinstance(held, Evidence):
             walls = {side: WristWall.of(rig) for side, rig in self.rigs.items()}
             self._walls = {side: wall for side, wall in walls.items() if wall is not None}
@@ -488,7 +485,6 @@ def make_model(
             dpd=dpd.enabled,
             rank=dpd.rank,
             template=settings.heads,
-            shadows=settings.shadows,
         )
     if subject is not None:
         model.keep(subject)

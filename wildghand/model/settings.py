@@ -17,16 +17,21 @@ from hwp_bench.base.records import flattened, merged
 from hwp_bench.methods.settings import check_source, choice, number, settings_from
 from wildghand.dpd.dpd import DpdSettings
 from wildghand.evidence import EvidenceSettings
-from wildghand.light import LightSettings, ShadowSettings
 from wildghand.model.terms import TermSettings
 from wildghand.network.settings import SIZES, NetworkSettings, network_settings
 from wildghand.pao.pao import PAPER_PAO, PaoSettings
-from wildghand.poses.errors import PoseSettings
 from wildghand.prepass import PrepassSettings
-from wildghand.subject import SubjectSettings
 
 #: Where messages place a wrong setting.
 WHERE = "wildghand"
+
+
+@dataclass(frozen=True)
+class Switch:
+    """An addition whose numbers are constants beside their use."""
+
+    #: Whether it is a part of the fit.
+    enabled: bool = True
 
 
 @dataclass(frozen=True)
@@ -69,9 +74,6 @@ class ScheduleSettings:
     #: Addition: after the last step, go back to an earlier state of the fit where that draws the
     #: validation frames better. With fewer than four of these frames it ends with the last state.
     validated: bool = True
-    #: Most training frames for each second of a budget in seconds, evenly spread; 0: all. Every
-    #: frame is judged before the first step, at a cost.
-    frames_per_second: float = number(4.0, 0.0, 1e6)
     #: Stop when the loss has not fallen by 0.1 % over this many steps; 0 never stops early.
     plateau_steps: int = number(0, 0, 10_000_000)
     #: Adam's steps for the network at the start: `fast`, or the authors' `published`.
@@ -104,13 +106,13 @@ class WildGHandSettings:
     #: Component: template offsets (head iii) and refinement of the hand parameters (head iv).
     heads: bool = True
     #: Addition: given poses are corrected by what the clip's poses have in common.
-    poses: PoseSettings = field(default_factory=PoseSettings)
+    poses: Switch = field(default_factory=Switch)
     #: Addition: the template is bent to the person before the fit.
-    subject: SubjectSettings = field(default_factory=SubjectSettings)
+    subject: Switch = field(default_factory=Switch)
     #: Addition: a light for normals that no frame has shown.
-    light: LightSettings = field(default_factory=LightSettings)
+    light: Switch = field(default_factory=Switch)
     #: Addition: shadows that the hands cast on themselves and on each other.
-    shadows: ShadowSettings = field(default_factory=ShadowSettings)
+    shadows: Switch = field(default_factory=Switch)
     #: Addition: Gaussians that few frames show are discs on the skin.
     evidence: EvidenceSettings = field(default_factory=EvidenceSettings)
     #: Addition: the judge of the frames. It says where the temporal weights start, which pixels are
@@ -130,8 +132,20 @@ class WildGHandSettings:
         check_source(self.perceptual, "perceptual", ("filter-bank",), ("vgg19",))
 
 
+#: Without the additions, of which each is a table.
+_NO_ADDITIONS: Mapping[str, Any] = MappingProxyType(
+    {
+        "start_colors": False,
+        "schedule": {"validated": False},
+        **{
+            name: {"enabled": False}
+            for name in ("poses", "subject", "light", "shadows", "evidence", "prepass")
+        },
+    }
+)
 #: What the paper and the authors' code have in common, in place of the defaults.
-_PUBLISHED: Mapping[str, Any] = MappingProxyType(
+_PUBLISHED: Mapping[str, Any] = merged(
+    _NO_ADDITIONS,
     {
         "dpd": {"rank": 0, "gains": False},
         "pao": {
@@ -141,19 +155,11 @@ _PUBLISHED: Mapping[str, Any] = MappingProxyType(
             "error_threshold": PAPER_PAO.error_threshold,
             "share_threshold": PAPER_PAO.share_threshold,
         },
-        "start_colors": False,
-        "poses": {"enabled": False},
-        "subject": {"enabled": False},
-        "light": {"enabled": False},
-        "shadows": {"enabled": False},
-        "evidence": {"enabled": False},
-        "prepass": {"enabled": False},
         "schedule": {
             "batch": 4,
             "texture_every": 1,
             "decay": "halving",
             "average_share": 0.0,
-            "validated": False,
             "dpd_rate": 1e-4,
         },
         "terms": {
@@ -163,7 +169,7 @@ _PUBLISHED: Mapping[str, Any] = MappingProxyType(
             "surface": 0.0,
             "perceptual": 0.1,
         },
-    }
+    },
 )
 
 #: The modes: settings by name, in place of the defaults. `default`: what measurements keep.
@@ -175,20 +181,15 @@ MODES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
         "default": {},
         "paper": merged(_PUBLISHED, {"pao": {"temporal": "all"}}),
         "released": merged(_PUBLISHED, {"pao": {"temporal": "none"}}),
-        "bare": {
-            "prior": "",
-            "dpd": {"enabled": False},
-            "pao": {"enabled": False},
-            "start_colors": False,
-            "poses": {"enabled": False},
-            "subject": {"enabled": False},
-            "light": {"enabled": False},
-            "shadows": {"enabled": False},
-            "evidence": {"enabled": False},
-            "prepass": {"enabled": False},
-            "schedule": {"validated": False},
-            "terms": {"surface": 0.0, "leave_hidden": False},
-        },
+        "bare": merged(
+            _NO_ADDITIONS,
+            {
+                "prior": "",
+                "dpd": {"enabled": False},
+                "pao": {"enabled": False},
+                "terms": {"surface": 0.0, "leave_hidden": False},
+            },
+        ),
     }
 )
 

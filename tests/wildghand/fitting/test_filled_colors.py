@@ -15,7 +15,6 @@ from tiny_fits import UNJUDGED
 from hwp_bench.hands import load_template
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.avatar.files import load_avatar, save_avatar
-from wildghand.evidence import EvidenceSettings
 from wildghand.fitting.colors import (
     FilledColors,
     OtherHand,
@@ -24,6 +23,7 @@ from wildghand.fitting.colors import (
     roughness,
     smooth_fill,
 )
+from wildghand.fitting.data import FitData
 from wildghand.fitting.evidence import FewShown
 from wildghand.fitting.fit import Fit
 from wildghand.gaussians.regularizers import nearest_on_surface, rest_anchors
@@ -144,7 +144,7 @@ def test_nothing_is_filled_without_a_light(make_training: TrainingMaker) -> None
 def test_without_judges_the_settings_share_holds_and_an_avatar_keeps_it(
     make_training: TrainingMaker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(EvidenceSettings, "validated", False)
+    monkeypatch.setattr(FitData, "judges", None)
     fit = begun(make_training(), **{"light.enabled": False})
     (expected,) = part(fit, FewShown).filled.carried_on([0.02])
     assert expected is not None
