@@ -43,10 +43,6 @@ class EvidenceSettings:
     #: Share of the training frames that must show a Gaussian until half of its shape and
     #: transparency is kept: an image says more of these than of an offset.
     shape_share: ClassVar[float] = 0.002
-    #: After the last step, take a quarter or four times of `offset_share`, or 0, where that draws
-    #: the validation frames better, and nothing of it where that draws them much better; then five
-    #: times of `fill_share`, or 0. With fewer than four of these frames the settings hold.
-    validated: ClassVar[bool] = True
 
 
 _WALLS = "evidence_wall_"

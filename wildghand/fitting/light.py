@@ -12,11 +12,10 @@ import time
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from hwp_bench.base.colors import srgb_to_linear
 from hwp_bench.hands import pose_hand
-from wildghand.evidence.count import read_images, seen_anchors
+from wildghand.evidence.count import facing_of, read_images, seen_anchors
 from wildghand.fitting.fit import Batch, Component, DrawOptions, Fit
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import HandRig
@@ -31,7 +30,6 @@ from wildghand.light import (
     fit_light,
     obstacles_in_frames,
 )
-from wildghand.model.frames import camera_centres
 from wildghand.model.model import WildGHandModel
 
 # Weight of a frame from which it is read, if at least so many frames have it.
@@ -41,6 +39,12 @@ _FACING, _VISIBLE = 0.35, 0.05
 # Cosine between normal and viewing direction from which a place is seen, and from which its colour
 # counts: at a grazing angle pixels are mixed with what is behind.
 _SEEN, _COUNTED = 0.02, 0.25
+#: Frames that are read at most for the light that casts shadows, spread over the clip, and places
+#: on each hand: rays to all candidate lamps take a second.
+FRAMES, PLACES = 96, 400
+#: Samples from which the light beyond the normals is fitted, at most: more change nothing, and take
+#: time.
+SAMPLES = 40_000
 #: Frames that are predicted at a time.
 CHUNK = 16
 
@@ -53,7 +57,7 @@ class Shadows(Component):
 
     def before(self, fit: Fit) -> None:
         """Find the light, and let the model keep it; none where too little of a hand is seen."""
-        light = find_light(shadow_samples(fit), fit.settings.shadows)
+        light = find_light(shadow_samples(fit))
         if light is not None:
             fit.model.keep(light)
             assert fit.model.shadows is not None
@@ -92,13 +96,11 @@ class UnseenLight(Component):
 
 def learn_light(fit: Fit, frames: int | None = None) -> KnownLight | None:
     """Fit a light to what a model says of the clip; None where too little of it is seen."""
-    weights, settings = fit.data.judgement.frame_weights, fit.settings.light
+    weights = fit.data.judgement.frame_weights
     count = len(weights)
     read = count if frames is None else frames
-    samples = light_samples(
-        fit.model, fit.clip, weights[:read], settings.samples * read // count, fit.seed
-    )
-    return fit_light(samples)
+    most = SAMPLES * read // count
+    return fit_light(light_samples(fit.model, fit.clip, weights[:read], most, fit.seed))
 
 
 def _timed(fit: Fit, frames: int) -> float:
@@ -128,8 +130,7 @@ def light_samples(
             anchors = clip.hand(side, part)
             prediction = model.predict(side, anchors, clip.parameters[side][0][part])
             turned = quat_third_axis(anchors.orientations)
-            away = camera_centres(clip.viewmats[part])[:, None] - anchors.positions
-            facing = (normalize(away, dim=-1) * turned).sum(dim=-1).cpu()
+            facing = facing_of(anchors, clip.viewmats[part]).cpu()
             chosen = (facing > _SEEN) & (torch.rand(facing.shape, generator=generator) < share)
             frame, place = chosen.nonzero(as_tuple=True)
             colors = prediction.raw.logit_colors.sigmoid() * prediction.shadow
@@ -151,9 +152,9 @@ def light_samples(
 @torch.no_grad()
 def shadow_samples(fit: Fit) -> ShadowSamples:
     """Read the colours of places in the frames that the pre-pass weighs most."""
-    data, settings, rigs, clip = fit.data, fit.settings.shadows, fit.model.rigs, fit.clip
+    data, rigs, clip = fit.data, fit.model.rigs, fit.clip
     judgement = data.judgement
-    rows = best_of_each_part(judgement.frame_weights, settings.frames)
+    rows = best_of_each_part(judgement.frame_weights, FRAMES)
     good = judgement.frame_weights[rows] > _GOOD
     rows = rows[good] if int(good.sum()) >= _LEAST else rows
     here = rows.to(clip.viewmats.device)
@@ -165,7 +166,7 @@ def shadow_samples(fit: Fit) -> ShadowSamples:
     found: list[tuple[np.ndarray, ...]] = []
     first = 0
     for side, rig in rigs.items():
-        chosen = generator.permutation(len(rig))[: settings.places]
+        chosen = generator.permutation(len(rig))[:PLACES]
         pixels, facing = (part[:, chosen] for part in seen[side])
         weights = (read_images(says, pixels) * facing).cpu().numpy()
         weights[facing.cpu().numpy() <= _FACING] = 0.0
