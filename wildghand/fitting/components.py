@@ -26,7 +26,7 @@ def components_of(settings: WildGHandSettings) -> list[Component]:
     is put together; what ends a fit comes last.
     """
     pao, evidence = settings.pao, settings.evidence
-    chosen = settings.schedule.validated or (evidence.enabled and evidence.validated)
+    chosen = settings.schedule.validated or evidence.enabled
     by_regions = pao.enabled and pao.variant != "binary"
     listed: list[tuple[bool, type[Component]]] = [
         (settings.poses.enabled, Poses),

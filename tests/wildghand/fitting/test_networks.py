@@ -99,7 +99,7 @@ def test_the_binary_mask_is_the_hand_that_was_chosen(
     found = weights(training, **binary, **{"pao.hand": hand})
     settings = read_settings({**FIT, **binary})
     fit = make_fit(training, settings, 0, torch.device("cpu"))
-    masks = hand_masks(training, fit.data.frames, hand, torch.device("cpu"))
+    masks = hand_masks(fit.data, hand, torch.device("cpu"))
     assert torch.equal(found, (masks[:3] > 127).float())
     assert not torch.equal(masks, fit.data.frames.masks)
     if source == "graph-cut":  # the painted hand is where its parameters say, and alone
