@@ -181,6 +181,8 @@ class Fit(IterativeFit[WildGHandAvatar]):
         self.device = device
         self.world = world
         self.components = components
+        self.plateau_steps = settings.schedule.plateau_steps
+        self.shared_steps = settings.schedule.texture_every
         self.data = FitData(training, device)
         for component in components:
             component.prepare(self)
@@ -196,16 +198,6 @@ class Fit(IterativeFit[WildGHandAvatar]):
         self.descent = Descent(self.model, others, settings.schedule, self._loss_of_features)
         for component in components:
             component.begin(self)
-
-    @property
-    def plateau_steps(self) -> int:  # type: ignore[override]
-        """See `IterativeFit`."""
-        return self.settings.schedule.plateau_steps
-
-    @property
-    def shared_steps(self) -> int:  # type: ignore[override]
-        """See `IterativeFit`."""
-        return self.settings.schedule.texture_every
 
     def part(self, kind: type[Kind]) -> Kind | None:
         """The component of a kind; None where it is left out."""

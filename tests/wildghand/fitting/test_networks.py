@@ -184,7 +184,6 @@ def test_an_ablation_takes_the_networks_too(
     folder: Path, make_painted: Callable[..., Capture], tmp_path: Path, capsys: Any
 ) -> None:
     settings = {**FIT, "mode": "paper", "pao.hand": f"sam:{folder / 'sam.pth'}"}
-    settings["pao.regions"] = f"sam:{folder / 'sam.pth'}"
     command = ["ablate", "--binary-mask", "--seeds", "1", "-o", str(tmp_path / "runs")]
     command += ["--capture", str(make_painted().root), *options(settings)]
     assert hwp_bench(command) == 0, capsys.readouterr().err

@@ -11,7 +11,6 @@ import torch
 import trimesh
 from tiny_fits import UNJUDGED
 
-from hwp_bench.base.errors import BadInput
 from hwp_bench.hands import load_template, pose_hand, vertex_normals
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.avatar.files import load_avatar, save_avatar
@@ -202,26 +201,3 @@ def test_a_fit_finds_a_light_unless_it_is_switched_off(make_training: TrainingMa
     assert without.model.shadows is None
     assert without.part(Shadows) is None
     assert not [name for name, _ in without.model.named_buffers() if name.startswith("shadows_")]
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("shadows_directions", torch.zeros(3, 2)),
-        ("shadows_directions", torch.full((3, 3), 2.0)),
-        ("shadows_strengths", torch.tensor([0.1, -0.1, 0.0])),
-        ("shadows_strengths", torch.zeros(5)),
-        ("shadows_strengths", None),
-        ("shadows_ambient", torch.tensor(float("nan"))),
-    ],
-    ids=str,
-)
-def test_hostile_lights_are_refused_by_name(name: str, value: torch.Tensor | None) -> None:
-    tensors = a_light().to_tensors()
-    if value is None:
-        del tensors[name]
-    else:
-        tensors[name] = value
-    with pytest.raises(BadInput, match=name):
-        CastLight.from_tensors(tensors, "an avatar")
-    assert CastLight.from_tensors({}, "an avatar") is None

@@ -6,12 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from hwp_bench.base.errors import BadInput
 from hwp_bench.capture import Cameras
 from hwp_bench.hands import HandParameters, load_template
 from hwp_bench.hands.poses import posed_skeleton, rest_skeleton, turned
@@ -291,17 +289,3 @@ def test_remembered_poses_are_read_as_written() -> None:
     for hand in (given.at(0, "right"), _truth().at(0, "right")):
         first, second = (one.corrected({"right": hand})["right"] for one in (poses, again))
         np.testing.assert_array_equal(first.pose, second.pose)
-
-
-@pytest.mark.parametrize(
-    "tensors",
-    [
-        {"poses_given_right": torch.zeros(4, 51)},
-        {"poses_given_right": torch.zeros(4, 51), "poses_believed_right": torch.zeros(5, 51)},
-        {"poses_given_right": torch.zeros(4, 50), "poses_believed_right": torch.zeros(4, 50)},
-        {"poses_given_right": torch.zeros(()), "poses_believed_right": torch.zeros(())},
-    ],
-)
-def test_damaged_tables_are_refused_by_name(tensors: dict[str, torch.Tensor]) -> None:
-    with pytest.raises(BadInput, match=r"poses_.*_right"):
-        ClipPoses.from_tensors(tensors, "file")
