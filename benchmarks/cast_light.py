@@ -23,7 +23,7 @@ from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import load_avatar
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.light import CastLight
-from wildghand.light.fit_lights import CONE, SKY
+from wildghand.light.light import CONE, SKY
 from wildghand.model.dress import Gaussians
 from wildghand.model.frames import rasterize_hands
 

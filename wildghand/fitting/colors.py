@@ -23,14 +23,14 @@ from wildghand.evidence import ColorChanges, kept_share, shown_frames
 from wildghand.evidence.count import read_images, seen_anchors
 from wildghand.fitting.data import FitData
 from wildghand.fitting.fit import Component, Fit
-from wildghand.fitting.light import Shadows, best_of_each_part
+from wildghand.fitting.light import Lighting, best_of_each_part
 from wildghand.gaussians.attributes import CHANNELS, SIZES
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.regularizers import nearest_on_surface, rest_anchors
 from wildghand.gaussians.rig import HandRig
 from wildghand.gaussians.training import TrainingClip
 from wildghand.light import KnownLight
-from wildghand.light.lights import ring_around
+from wildghand.light.light import ring_around
 from wildghand.model.model import WildGHandModel
 from wildghand.network.surface import Chart, PlaneSampler
 
@@ -200,7 +200,7 @@ def start_from_colors(fit: Fit) -> None:
     The shadows and the light are taken out of the colours. Nothing is random. A network without a
     direct path from map to attributes stays as it is.
     """
-    model, clip, data, cast = fit.model, fit.clip, fit.data, fit.part(Shadows)
+    model, clip, data, cast = fit.model, fit.clip, fit.data, fit.part(Lighting)
     direct = model.network.attribute_head.direct
     if direct is None:
         return

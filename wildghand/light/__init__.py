@@ -1,14 +1,7 @@
 """Light: beyond what a clip shows, and where hands keep it from themselves and from each other."""
 
-from wildghand.light.fit_lights import (
-    KnownLight,
-    LightSamples,
-    ShadowSamples,
-    find_light,
-    fit_light,
-)
 from wildghand.light.hand_shadows import HandShadows, Obstacles, ShadowTable, obstacles_in_frames
-from wildghand.light.lights import CastLight
+from wildghand.light.light import CastLight, KnownLight, LightSamples, find_light, fit_light
 
 __all__ = [
     "CastLight",
@@ -16,7 +9,6 @@ __all__ = [
     "KnownLight",
     "LightSamples",
     "Obstacles",
-    "ShadowSamples",
     "ShadowTable",
     "find_light",
     "fit_light",

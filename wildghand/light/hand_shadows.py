@@ -13,7 +13,7 @@ from hwp_bench.base.rays import ray_mesh
 from hwp_bench.hands import TemplateTensors, pose_hand, vertex_normals
 from wildghand.gaussians.rig import HandRig
 from wildghand.gaussians.training import TrainingClip, upload
-from wildghand.light.lights import DARKEST, SRGB, CastLight
+from wildghand.light.light import DARKEST, SRGB, CastLight
 
 #: How far a ray starts from the skin, m: the surface of an estimated hand is not exact, and a
 #: fold must not shade itself.

@@ -26,7 +26,7 @@ from wildghand.fitting.descent import Descent
 from wildghand.fitting.disentangle import Dpd
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.judging import HiddenSkin
-from wildghand.fitting.light import Shadows
+from wildghand.fitting.light import Lighting
 from wildghand.fitting.objective import Regularisers
 from wildghand.fitting.weights import MaskWeights, Pao
 from wildghand.gaussians.fit_loop import WINDOW, Guard, batches, choose_device, ready_device
@@ -154,7 +154,7 @@ def fake_fit(training: TrainingCapture, changes: dict[str, Any]) -> Fit:
     if fit.model.shadows is not None:
         for name in ("_corners", "_directions", "_strengths"):
             setattr(fit.model.shadows, name, moved(getattr(fit.model.shadows, name)))
-        table = part(fit, Shadows)._table
+        table = part(fit, Lighting)._table
         assert table is not None
         table._device = FAKE
     for kind in (HiddenSkin, Pao, MaskWeights):

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from wildghand.light import CastLight, ShadowSamples, find_light
-from wildghand.light.lights import ring_around, spread_directions
+from wildghand.light import CastLight, LightSamples, find_light
+from wildghand.light.light import ring_around, spread_directions
 
 LAMPS = np.array([[0.55, -0.6, -0.58], [-0.7, -0.2, -0.69]])
 LAMPS /= np.linalg.norm(LAMPS, axis=1, keepdims=True)
@@ -29,7 +29,7 @@ def free(points: np.ndarray, directions: np.ndarray) -> np.ndarray:
 
 def samples(
     count: int = 6000, seed: int = 0, lamps: np.ndarray = LAMPS, shadows: bool = True
-) -> tuple[ShadowSamples, np.ndarray]:
+) -> tuple[LightSamples, np.ndarray]:
     """Places of random albedo near a plane that turn towards -z and move, and their points."""
     random = np.random.default_rng(seed)
     normals = random.normal(size=(count, 3)) * [1.0, 1.0, 0.6] - [0.0, 0.0, 0.8]
@@ -41,7 +41,7 @@ def samples(
     strengths = STRENGTHS[: len(lamps)]
     irradiance = AMBIENT + (np.maximum(normals @ lamps.T, 0.0) * arrives) @ strengths
     light = albedo[places] * irradiance * random.normal(1.0, 0.03, count)
-    made = ShadowSamples(
+    made = LightSamples(
         places, normals, light, np.ones(count), lambda directions: free(points, directions)
     )
     return made, points

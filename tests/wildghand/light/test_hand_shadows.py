@@ -15,7 +15,7 @@ from hwp_bench.hands import load_template, pose_hand, vertex_normals
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.avatar.files import load_avatar, save_avatar
 from wildghand.fitting.components import make_fit
-from wildghand.fitting.light import Shadows
+from wildghand.fitting.light import Lighting
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import HandRig, make_rig
 from wildghand.light import CastLight, HandShadows, Obstacles, ShadowTable
@@ -193,11 +193,11 @@ def test_training_frames_are_drawn_with_their_shadows(make_training: TrainingMak
 def test_a_fit_finds_a_light_unless_it_is_switched_off(make_training: TrainingMaker) -> None:
     found = make_fit(make_training(), read_settings(UNJUDGED), 0, torch.device("cpu"))
     assert found.model.shadows is not None
-    shadows = found.part(Shadows)
+    shadows = found.part(Lighting)
     assert shadows is not None
     assert set(shadows.dark(torch.tensor([0]))) == {"right"}
     off = read_settings({**UNJUDGED, "shadows.enabled": False})
     without = make_fit(make_training(), off, 0, torch.device("cpu"))
     assert without.model.shadows is None
-    assert without.part(Shadows) is None
+    assert not without.part(Lighting).dark(torch.tensor([0]))
     assert not [name for name, _ in without.model.named_buffers() if name.startswith("shadows_")]
