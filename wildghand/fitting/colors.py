@@ -1,9 +1,9 @@
 """Colours of places that frames do not show well: before the fit, and after it.
 
 Before it, the identity map starts from the frames' colours where no skin has these (`StartColors`).
-After it, a hand takes the colours of the other hand (`OtherHand`), and places that few frames have
-shown take those of the skin around them (`FilledColors`). These two compare colours under the light
-that the clip shows, as logarithms of linear light.
+After it, places that few frames have shown take the colours of the skin around them and of the
+same place of the other hand (`FilledColors`), compared under the light that the clip shows, as
+logarithms of linear light.
 """
 
 from __future__ import annotations
@@ -19,9 +19,8 @@ import torch
 from torch import Tensor
 
 from hwp_bench.base.colors import linear_to_srgb, srgb_to_linear
-from wildghand.evidence import ColorChanges, kept_share, shown_frames
+from wildghand.evidence import ColorChanges, kept_share
 from wildghand.evidence.count import read_images, seen_anchors
-from wildghand.fitting.data import FitData
 from wildghand.fitting.fit import Component, Fit
 from wildghand.fitting.light import Lighting, best_of_each_part
 from wildghand.gaussians.attributes import CHANNELS, SIZES
@@ -53,16 +52,12 @@ _COLORS = slice(CHANNELS - SIZES["logit_colors"], CHANNELS)
 _RING, _INSIDE = 4, 0.6
 # sRGB nearer to 0 or 1, and linear light below this, say nothing.
 _EDGE, _DARKEST = 0.005, 1e-3
-# Weight of a frame from which its colours begin to count; what perturbs a frame changes them.
-_UNSURE = 0.35
-# A colour that is somebody's is better than none: it takes so much less to be lent.
-_LENT = 0.25
-_OTHER = {"left": "right", "right": "left"}
-# Neighbours of a Gaussian, and what a squared difference from one of them weighs against a squared
-# change of a colour that is fully known.
-_NEIGHBOURS, _SMOOTH = 8, 0.3
-# Weight of the mean colour where nothing around is known either.
-_MEAN = 1e-6
+# Neighbours of a Gaussian, and what a squared difference from one of them, and from the same place
+# of the other hand, weighs against a squared change of a colour that is fully known.
+_NEIGHBOURS, _SMOOTH, _ALIKE = 8, 0.3, 10.0
+# How far a colour counts as known where nothing around it is filled in, and the weight of the mean
+# colour where nothing around is known either.
+_OWN, _MEAN = 1e-2, 1e-6
 
 
 class StartColors(Component):
@@ -79,72 +74,14 @@ class StartColors(Component):
         start_from_colors(fit)
 
 
-class OtherHand(Component):
-    """Where clean frames have shown a place of one hand alone, the other hand takes its colour.
-
-    Both hands of a person look alike. The network alone does not do this: each hand has a map of
-    its own.
-
-    Attributes:
-        own: (N,) by side in [0, 1), how far each Gaussian's colour is the hand's own; empty:
-            nothing is taken.
-        lent: (N,) by side in [0, 1), how far it is good enough for the other hand.
-    """
-
-    def __init__(self) -> None:
-        self.own: Mapping[str, np.ndarray] = {}
-        self.lent: Mapping[str, np.ndarray] = {}
-
-    def before(self, fit: Fit) -> None:
-        """Count what clean frames show of each of two hands."""
-        if len(fit.model.rigs) < 2:
-            return
-        count = len(fit.data.frames)
-        shown = shown_frames(
-            fit.model.rigs, fit.clip, functools.partial(clearly_visible, fit.data), count
-        )
-        half = fit.settings.evidence.color_share * count
-
-        def shares(half: float) -> dict[str, np.ndarray]:
-            return {side: kept_share(n, half).cpu().double().numpy() for side, n in shown.items()}
-
-        self.own, self.lent = shares(half), shares(_LENT * half)
-
-    def after(self, fit: Fit) -> None:
-        """Give each hand the colours that it takes."""
-        found = self.learn(fit)
-        if found is not None:
-            fit.model.keep(found)
-
-    @torch.no_grad()
-    def learn(self, fit: Fit) -> ColorChanges | None:
-        """The colours that the hands take; None where they take none.
-
-        They are compared at normals that the clip's light knows; without a light nothing is taken.
-        """
-        light = fit.model.light
-        if not self.own or light is None:
-            return None
-        logits = {side: known_logits(fit.model, fit.clip, side, light) for side in self.own}
-        levels = {side: log_linear(values) for side, values in logits.items()}
-        mixed = {}
-        for side, level in levels.items():
-            difference = levels[_OTHER[side]] - level
-            mixed[side] = level + self.taken(side)[:, None] * difference
-        return changes_to(mixed, logits, fit.device)
-
-    def taken(self, side: str) -> np.ndarray:
-        """(N,) in [0, 1), how much of the other hand's colours a hand takes; of two hands."""
-        return (1.0 - self.own[side]) * self.lent[_OTHER[side]]
-
-
 @dataclass(eq=False)
 class FilledColors:
-    """The colours that places take from the skin around them, which few frames have shown or none.
+    """The colours that places take which few frames have shown or none: one smooth fill.
 
     The network's colours of such places are nobody's: they began as the prior's and went where the
     weights went that other places moved, which leaves blotches. What is known of the skin is
-    carried on to them as smoothly as can be.
+    carried on to them as smoothly as can be, over edges between neighbours and, as both hands of a
+    person look alike, between the same places of two hands.
     """
 
     #: Of one or two hands.
@@ -153,18 +90,20 @@ class FilledColors:
     shown: Mapping[str, Tensor]
 
     def carried_on(self, shares: Sequence[float]) -> list[ColorChanges | None]:
-        """All changes of colours, those of the model and those of places that are seldom shown."""
-        light, before = self.fit.model.light, self.fit.model.color_changes
-        if light is None or not any(share > 0.0 for share in shares):
-            return [before] * len(shares)
-        logits, levels = {}, {}
-        for side in self.fit.model.rigs:
-            logits[side] = known_logits(self.fit.model, self.fit.clip, side, light)
-            change = 0.0 if before is None else before.changes[side].double().cpu().numpy()
-            levels[side] = log_linear(logits[side] + change)
-        device = self.fit.device
+        """The changes of colours for some values of `evidence.fill_share`; None: nothing changes.
+
+        With a share of 0 the skin around a place says nothing of it, and the other hand all the
+        same. Colours are compared at normals that the clip's light knows; without one none change.
+        """
+        model, clip, light = self.fit.model, self.fit.clip, self.fit.model.light
+        if light is None or not self.fit.settings.evidence.fill_share:
+            return [None] * len(shares)
+        logits = {side: known_logits(model, clip, side, light) for side in model.rigs}
+        levels = {side: log_linear(values) for side, values in logits.items()}
         return [
-            changes_to(self._filled(levels, share), logits, device) if share > 0.0 else before
+            changes_to(self._filled(levels, share), logits, self.fit.device)
+            if share > 0.0 or self._joined
+            else None
             for share in shares
         ]
 
@@ -173,24 +112,29 @@ class FilledColors:
         rigs = self.fit.model.rigs
         self._filled({side: np.zeros((len(rig), 3)) for side, rig in rigs.items()}, 1.0)
 
+    @property
+    def _joined(self) -> bool:
+        return len(self.fit.model.rigs) == 2 and self.fit.settings.evidence.other_hand
+
     def _filled(self, levels: Mapping[str, np.ndarray], share: float) -> dict[str, np.ndarray]:
-        return {
-            side: smooth_fill(self._roughness[side], values, self._known(side, share))
-            for side, values in levels.items()
-        }
+        from scipy.sparse import block_diag
+
+        half = (share or self.fit.settings.evidence.fill_share) * len(self.fit.data.frames)
+        smooth, least = (_SMOOTH, 0.0) if share > 0.0 else (0.0, _OWN)
+        found: dict[str, np.ndarray] = {}
+        for hands in [[*levels]] if self._joined else [[side] for side in levels]:
+            edges = smooth * block_diag([self._roughness[side] for side in hands])
+            if self._joined:
+                edges = edges + _ALIKE * between_hands(edges.shape[0] // 2)
+            shown = torch.cat([self.shown[side] for side in hands]).double().cpu()
+            known = np.maximum(kept_share(shown, half).numpy(), least)
+            filled = smooth_fill(edges, np.concatenate([levels[side] for side in hands]), known)
+            found |= zip(hands, np.split(filled, len(hands)), strict=True)
+        return found
 
     @functools.cached_property
     def _roughness(self) -> dict[str, Any]:
         return {side: roughness(rig) for side, rig in self.fit.model.rigs.items()}
-
-    def _known(self, side: str, share: float) -> np.ndarray:
-        """(N,) in [0, 1), how far a Gaussian's colour is known, from either hand."""
-        frames = self.shown[side].double().cpu()
-        known: np.ndarray = kept_share(frames, share * len(self.fit.data.frames)).numpy()
-        other = self.fit.part(OtherHand)
-        if other is not None and other.own:
-            known = 1.0 - (1.0 - known) * (1.0 - other.taken(side))
-        return known
 
 
 @torch.no_grad()
@@ -266,23 +210,11 @@ def _spread(sampler: PlaneSampler, values: Tensor, weights: Tensor) -> Tensor:
     return asked[:, :-1] / (asked[:, -1:] + _CELL)
 
 
-def clearly_visible(data: FitData, rows: Tensor) -> Tensor:
-    """How much pixels say of a hand's colour: as `visible`, but of frames that are sure alone."""
-    weights = data.judgement.frame_weights
-    sure = ((weights - _UNSURE) / (1.0 - _UNSURE)).clamp(0.0, 1.0) / weights.clamp(min=1e-3)
-    says = data.visible(rows)
-    return says * sure[rows].to(says)[:, None, None]
-
-
 @torch.no_grad()
 def known_logits(
     model: WildGHandModel, clip: TrainingClip, side: str, light: KnownLight
 ) -> np.ndarray:
-    """Mean colour of each Gaussian over known normals and poses of the clip.
-
-    Returns:
-        (N, 3) in logits of sRGB.
-    """
+    """(N, 3) mean colour of each Gaussian over known normals and poses of the clip, in logits."""
     poses = clip.parameters[side][0]
     normals = known_normals(light).to(poses)
     rows = torch.linspace(0, len(poses) - 1, len(normals)).long().to(poses.device)
@@ -335,13 +267,24 @@ def roughness(rig: HandRig) -> Any:
     return diags_array(edges.sum(axis=1)) - edges
 
 
-def smooth_fill(rough: Any, values: np.ndarray, known: np.ndarray) -> np.ndarray:
+def between_hands(count: int) -> Any:
+    """(2 N, 2 N) sparse form: the sum of squared differences between the same places of two hands.
+
+    Both hands have their Gaussians at the same places of the skin.
+    """
+    from scipy.sparse import eye_array, kron
+
+    return kron(np.array([[1.0, -1.0], [-1.0, 1.0]]), eye_array(count))
+
+
+def smooth_fill(edges: Any, values: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Carry values on from where they are known to where they are not.
 
     The filled values x are smooth and near what is known: they minimise the sum of known (x - v)^2
-    + 0.3 roughness(x). A value keeps its own part as far as it is known, and takes the rest from x.
+    + edges(x). A value keeps its own part as far as it is known, and takes the rest from x.
 
     Args:
+        edges: (N, N) sparse form that is 0 where x is the same everywhere.
         values: (N, C).
         known: (N,) in [0, 1].
 
@@ -353,7 +296,7 @@ def smooth_fill(rough: Any, values: np.ndarray, known: np.ndarray) -> np.ndarray
 
     if known.sum() <= 0.0:
         return values
-    system = diags_array(known + _MEAN) + _SMOOTH * rough
     mean = known @ values / known.sum()
-    found = splu(system.tocsc()).solve(known[:, None] * (values - mean)) + mean
+    solved = splu((diags_array(known + _MEAN) + edges).tocsc())
+    found = solved.solve(known[:, None] * (values - mean)) + mean
     return np.asarray(known[:, None] * values + (1.0 - known)[:, None] * found)

@@ -6,7 +6,7 @@ import torch
 
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.fitting.choice import Averaging, StateChoice, ValidationFrames
-from wildghand.fitting.colors import OtherHand, StartColors
+from wildghand.fitting.colors import StartColors
 from wildghand.fitting.disentangle import Dpd
 from wildghand.fitting.evidence import FewShown
 from wildghand.fitting.fit import Component, Fit
@@ -44,7 +44,6 @@ def components_of(settings: WildGHandSettings) -> list[Component]:
         (True, Pao if by_regions else MaskWeights),
         (True, Regularisers),
         (settings.dpd.enabled, Dpd),
-        (evidence.enabled and evidence.color_share > 0.0, OtherHand),
         (evidence.enabled, FewShown),
     ]
     return [kind() for wanted, kind in listed if wanted]

@@ -161,7 +161,7 @@ class FewShown(Component):
         found: list[Evidence | ColorChanges] = []
         if not evidence.equals(fit.model.evidence):
             found.append(evidence)
-        if colors is not None and colors is not fit.model.color_changes:
+        if colors is not None:
             found.append(colors)
         return found
 
@@ -174,11 +174,10 @@ class FewShown(Component):
         self, fit: Fit, judges: JudgedDrawings, several: Sequence[Evidence]
     ) -> tuple[Evidence, ColorChanges | None]:
         """One evidence of several, and with it the changes of colours."""
-        predicted = judges.predict_all()
-        changes, opened = fit.model.color_changes, frozenset(fit.model.rigs)
+        predicted, opened = judges.predict_all(), frozenset(fit.model.rigs)
 
         def error(evidence: Evidence) -> float:
-            return judges.error(predicted, evidence, changes)
+            return judges.error(predicted, evidence, None)
 
         # Of equal ones the first is taken, which is the settings' own.
         best, least = choose([(each, 0.0) for each in several], error)
@@ -188,11 +187,12 @@ class FewShown(Component):
             (replace(best.spare_all(), open_wrists=opened), _AS_LEARNT),
         )
         best, _ = choose(others, error, (best, least))
-        if fit.model.light is not None:
-            fills = self.filled.carried_on(fill_shares(fit.settings.evidence))
-            several_fills = [(each, 0.0) for each in fills]
-            changes, _ = choose(several_fills, lambda each: judges.error(predicted, best, each))
-        return best, changes
+        if fit.model.light is None:
+            return best, None
+        fills = self.filled.carried_on(fill_shares(fit.settings.evidence))
+        several_fills = [(each, 0.0) for each in fills]
+        colors, _ = choose(several_fills, lambda each: judges.error(predicted, best, each))
+        return best, colors
 
     def seconds(self, fit: Fit) -> float:
         """See `Component`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,8 +18,9 @@ from hwp_bench.methods.contract import TrainingCapture
 from wildghand.avatar.files import load_avatar, save_avatar
 from wildghand.fitting.colors import (
     FilledColors,
-    OtherHand,
+    between_hands,
     known_logits,
+    known_normals,
     log_linear,
     roughness,
     smooth_fill,
@@ -26,10 +28,13 @@ from wildghand.fitting.colors import (
 from wildghand.fitting.data import FitData
 from wildghand.fitting.evidence import FewShown
 from wildghand.fitting.fit import Fit
+from wildghand.gaussians.attributes import CHANNELS, SIZES
 from wildghand.gaussians.regularizers import nearest_on_surface, rest_anchors
 from wildghand.gaussians.rig import HandRig, make_rig
 
 PLAIN: dict[str, Any] = {**UNJUDGED, "shadows.enabled": False, "start_colors": False}
+# Channels of the colours in the attributes and in the map.
+COLORS = slice(CHANNELS - SIZES["logit_colors"], CHANNELS)
 TrainingMaker = Callable[..., TrainingCapture]
 
 
@@ -68,7 +73,7 @@ def test_the_fill_solves_the_normal_equations(rig: HandRig) -> None:
     dense = np.diag(known + 1e-6) + 0.3 * rough.toarray()
     smooth = np.linalg.solve(dense, known[:, None] * (values - mean)) + mean
     expected = known[:, None] * values + (1.0 - known)[:, None] * smooth
-    np.testing.assert_allclose(smooth_fill(rough, values, known), expected, atol=1e-9)
+    np.testing.assert_allclose(smooth_fill(0.3 * rough, values, known), expected, atol=1e-9)
 
 
 def test_known_values_stay_and_unknown_ones_lie_between_them(rig: HandRig) -> None:
@@ -76,7 +81,7 @@ def test_known_values_stay_and_unknown_ones_lie_between_them(rig: HandRig) -> No
     values = generator.uniform(1.0, 2.0, size=(300, 3))
     known = (generator.uniform(size=300) < 0.5).astype(float)
     values[known == 0.0] = 100.0  # nobody's
-    filled = smooth_fill(roughness(rig), values, known)
+    filled = smooth_fill(0.3 * roughness(rig), values, known)
     np.testing.assert_allclose(filled[known == 1.0], values[known == 1.0])
     assert filled.min() >= 1.0
     assert filled.max() <= 2.0
@@ -85,10 +90,10 @@ def test_known_values_stay_and_unknown_ones_lie_between_them(rig: HandRig) -> No
 def test_extremes_of_what_is_known(rig: HandRig) -> None:
     values, rough = np.random.default_rng(3).normal(size=(300, 3)), roughness(rig)
     # Nothing is known: nothing can be carried on. One place is: its colour goes everywhere.
-    assert np.array_equal(smooth_fill(rough, values, np.zeros(300)), values)
+    assert np.array_equal(smooth_fill(0.3 * rough, values, np.zeros(300)), values)
     one = np.zeros(300)
     one[17] = 1.0
-    filled = smooth_fill(rough, values, one)
+    filled = smooth_fill(0.3 * rough, values, one)
     np.testing.assert_allclose(filled, np.broadcast_to(values[17], (300, 3)), atol=1e-9)
 
 
@@ -99,30 +104,60 @@ def test_the_changes_lead_to_the_filled_colours(make_training: TrainingMaker) ->
     shown = part(fit, FewShown).shown["right"].double().numpy()
     known = shown / (shown + 0.02 * len(fit.data.frames))
     assert known.min() == 0.0  # the back, which no frame shows
-    expected = smooth_fill(roughness(fit.model.rigs["right"]), levels(fit, "right"), known)
+    expected = smooth_fill(0.3 * roughness(fit.model.rigs["right"]), levels(fit, "right"), known)
     assert np.abs(levels(fit, "right") - expected).max() > 0.1
     after = levels(fit, "right", found.changes["right"])
     np.testing.assert_allclose(after, expected, atol=2e-3)
 
 
-def test_colours_from_the_other_hand_are_known_and_carried_on(
-    make_training: TrainingMaker,
-) -> None:
+@pytest.fixture
+def hands(make_training: TrainingMaker) -> Fit:
+    """Two hands of other colours."""
     fit = begun(make_training("both"))
+    with torch.no_grad():
+        fit.model.network.identity.maps["left"][:, COLORS] += 0.5
+    return fit
+
+
+def known_of(fit: Fit, **known: float) -> FilledColors:
+    """A fill for which so much is known of each hand."""
+    half = 0.02 * len(fit.data.frames)
+    frames = {side: half * share / (1.0 - share) for side, share in known.items()}
     counts = {side: len(rig) for side, rig in fit.model.rigs.items()}
-    # No frame shows the left hand, and the right one knows all colours.
-    own = {"left": np.zeros(counts["left"]), "right": np.ones(counts["right"])}
-    other = part(fit, OtherHand)
-    other.own = other.lent = own
-    taken = other.learn(fit)
-    assert taken is not None
-    fit.model.keep(taken)
-    shown = {side: torch.zeros(count) for side, count in counts.items()}
-    shown["right"] += 1e9
-    found = FilledColors(fit, shown).carried_on([0.02])[0]
+    return FilledColors(fit, {s: torch.full((counts[s],), n) for s, n in frames.items()})
+
+
+def test_edges_join_the_same_places_of_two_hands() -> None:
+    values = np.random.default_rng(4).normal(size=(14, 2))
+    expected = ((values[:7] - values[7:]) ** 2).sum()
+    assert np.trace(values.T @ (between_hands(7) @ values)) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("share", [0.02, 0.1, 0.0])
+def test_a_hand_that_nothing_shows_takes_the_others_colours(share: float, hands: Fit) -> None:
+    (found,) = known_of(hands, left=0.0, right=0.999).carried_on([share])
     assert found is not None
-    for side, change in taken.changes.items():
-        np.testing.assert_allclose(found.changes[side].numpy(), change.numpy(), atol=1e-4)
+    before = {side: levels(hands, side) for side in ("left", "right")}
+    assert np.abs(before["left"] - before["right"]).mean() > 0.1
+    off = np.abs(levels(hands, "left", found.changes["left"]) - before["right"])
+    assert off.mean() < 0.1 * np.abs(before["left"] - before["right"]).mean()
+    np.testing.assert_allclose(found.changes["right"], 0.0, atol=0.05)
+
+
+def test_hands_that_frames_show_keep_their_colours(hands: Fit) -> None:
+    (found,) = known_of(hands, left=0.999, right=0.999).carried_on([0.02])
+    assert found is not None
+    for change in found.changes.values():
+        np.testing.assert_allclose(change, 0.0, atol=5e-3)
+
+
+def test_where_it_is_off_hands_have_nothing_of_each_other(make_training: TrainingMaker) -> None:
+    fit = begun(make_training("both"), **{"evidence.other_hand": False})
+    filled = known_of(fit, left=0.0, right=0.999)
+    changed, none = filled.carried_on([0.02, 0.0])
+    assert none is None
+    assert changed is not None
+    np.testing.assert_allclose(changed.changes["left"], 0.0, atol=1e-4)
 
 
 @pytest.mark.parametrize("changes", [{"evidence.fill_share": 0.0}, {"evidence.enabled": False}])
@@ -158,3 +193,11 @@ def test_without_judges_the_settings_share_holds_and_an_avatar_keeps_it(
     assert np.abs(drawn - before).max() > 0.01
     again = load_avatar(save_avatar(fit.avatar(0), tmp_path / "avatar"))
     np.testing.assert_array_equal(again.render(*where), drawn)
+
+
+def test_known_normals_lie_in_the_cap() -> None:
+    normals = known_normals(a_light(0.5)).double().numpy()
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-6)
+    np.testing.assert_allclose(
+        normals[:, 2], [-1.0] + 4 * [-math.cos(0.6 * math.pi / 3)], atol=1e-6
+    )
