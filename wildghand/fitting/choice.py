@@ -112,8 +112,7 @@ class StateChoice(Component):
         averaging, frames = fit.part(Averaging), fit.part(ValidationFrames)
         assert averaging is not None
         self.judges = None if frames is None else frames.drawings
-        count, batch = len(fit.data.frames), fit.settings.schedule.batch
-        first = 0 if self.judges is None else max(1, round(_FIRST * count / batch))
+        first = 0 if self.judges is None else max(1, round(_FIRST * fit.epoch))
         self.states = EarlierStates(averaging.average, first)
 
     def after_step(self, fit: Fit) -> None:
