@@ -347,8 +347,7 @@ class StateChoice(Component):
         assert averaging is not None
         self._average = averaging
         self.judges = None if frames is None else frames.drawings
-        count, batch = len(fit.data.frames), fit.settings.schedule.batch
-        self._first = 0 if self.judges is None else max(1, round(_FIRST * count / batch))
+        self._first = 0 if self.judges is None else max(1, round(_FIRST * fit.epoch))
 
     def after_step(self, fit: Fit) -> None:
         """Take note of a step."""

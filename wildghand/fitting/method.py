@@ -23,15 +23,13 @@ from wildghand.gaussians.rig import AnchorPoses
 from wildghand.gaussians.shading import fill_harmonics
 from wildghand.light import Obstacles
 from wildghand.model.dress import dress
-from wildghand.model.settings import read_settings
+from wildghand.model.settings import WildGHandSettings, read_settings
 from wildghand.network import NetworkOutput, Refinement
 from wildghand.network.frame_heads import warm_up_heads as warm_up_heads
 from wildghand.pao.sam import check_checkpoint
 from wildghand.plain.loop import run_fit
 from wildghand.splat.threads import denormals_flushed
 
-#: Most training frames for each second of a budget in seconds, evenly spread.
-FRAMES_PER_SECOND = 4.0
 # Training frames that a budget has room for at least: fewer say too little of a person.
 _LEAST = 16
 
@@ -68,20 +66,23 @@ class WildGHandMethod:
             BadInput: no training frame can be used.
             DidNotConverge: the fit diverged at once.
         """
-        training = affordable(training, budget)
+        training = affordable(training, self.settings, budget)
         return run_fit(make_fit(training, self.settings, self.seed, self.device), budget, report)
 
 
-def affordable(training: TrainingCapture, budget: Budget) -> TrainingCapture:
+def affordable(
+    training: TrainingCapture, settings: WildGHandSettings, budget: Budget
+) -> TrainingCapture:
     """Leave training frames out where judging all of them would take the budget away from steps.
 
     Before the first step every frame is loaded, judged, compared with the person's outline and
     counted as evidence: some 0.06 seconds for a frame of 256 px on one core. A clip of a thousand
     frames would spend a minute on that.
     """
-    if budget.seconds is None:
+    share = settings.schedule.frames_per_second
+    if budget.seconds is None or not share:
         return training
-    return training.thinned(max(_LEAST, int(FRAMES_PER_SECOND * budget.seconds)))
+    return training.thinned(max(_LEAST, int(share * budget.seconds)))
 
 
 def check_networks(values: Mapping[str, Any]) -> None:

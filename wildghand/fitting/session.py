@@ -162,7 +162,7 @@ def _fit_in(
         write_request(work / "request", capture, split, run)
     world.wait_for_main()
     chosen = read_settings(run.settings)
-    training = affordable(open_request(work / "request"), run.budget)
+    training = affordable(open_request(work / "request"), chosen, run.budget)
     digest = digest_of_request(work / "request", capture)
     entered = time.perf_counter()
     device = ready_fit(chosen.device)

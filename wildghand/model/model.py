@@ -18,6 +18,7 @@ from hwp_bench.hands import HandTemplate, sample_surface
 from wildghand.dpd.dpd import DynamicPerturbation, Perturbation, Temporal, bone_features
 from wildghand.dpd.temporal import scale_refinement
 from wildghand.evidence import ColorChanges, Evidence
+from wildghand.gaussians.attributes import RawAttributes
 from wildghand.gaussians.found import Found
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import AnchorPoses, HandRig, rig_of
@@ -71,6 +72,7 @@ class WildGHandModel(nn.Module):
         dpd: model perturbations as biases of the attributes.
         embedding: width of the temporal embedding.
         rank: of the field of biases; 0: none.
+        poses: the frames' poses are corrected by their temporal embedding.
         template: apply the network's displacement of the template (head iii).
 
     Attributes:
@@ -94,6 +96,7 @@ class WildGHandModel(nn.Module):
         dpd: bool = True,
         embedding: int = 256,
         rank: int = 0,
+        poses: bool = False,
         template: bool = True,
     ) -> None:
         super().__init__()
@@ -106,8 +109,9 @@ class WildGHandModel(nn.Module):
         self._walls: dict[str, WristWall] = {}
         self.rigs = dict(rigs)
         self.network = network
+        bounds = (network.settings.max_pose, network.settings.max_transl) if poses else None
         self.perturbation = nn.ModuleDict(
-            {side: DynamicPerturbation(frame_count, embedding, rank) for side in rigs}
+            {side: DynamicPerturbation(frame_count, embedding, rank, bounds) for side in rigs}
             if dpd
             else {}
         )
@@ -173,6 +177,7 @@ class WildGHandModel(nn.Module):
         refine: bool = False,
         features: Mapping[str, HandFeatures] | None = None,
         dark: Mapping[str, Tensor] | None = None,
+        plain: Tensor | None = None,
     ) -> RenderedFrames:
         """Draw training frames with everything that is particular to them.
 
@@ -183,6 +188,8 @@ class WildGHandModel(nn.Module):
             teach: from (B,) temporal weights, before dropout and without gradient, to how much the
                 canonical hand learns from each frame, (B,) in [0, 1], or None: all. None: all.
             dark: (B, N) factors of the hands' shadows by side, where they are at hand already.
+            plain: (B,) bool, frames whose attributes are those of the texture branch alone; None:
+                no frame.
         """
         if dark is None:
             hands = {
@@ -206,12 +213,19 @@ class WildGHandModel(nn.Module):
             prediction = self.predict(
                 side, anchors, pose.detach(), None if features is None else features[side]
             )
+            if plain is not None:
+                known = self.network.features(side) if features is None else features[side]
+                alone = self.network.attributes_of_texture(side, known).concatenate()
+                mixed = torch.where(plain[:, None, None], alone, prediction.raw.concatenate())
+                prediction = replace(prediction, raw=RawAttributes.split(mixed))
             prediction = dimmed(prediction, dark.get(side))
             if refine:
                 step = prediction.refinement
                 if shares is not None:
                     step = scale_refinement(step, shares)
                 pose, betas, transl = pose + step.pose, betas + step.betas, transl + step.transl
+                if side in self.perturbation:
+                    pose, transl = self.biases_of(side).move(pose, transl, temporal[side].z)
             if move or refine:
                 anchors = rig.follow(pose, betas, transl)
             perturbation, omega = None, pose.new_zeros(len(rows))
@@ -464,7 +478,8 @@ def make_model(
             network,
             frame_count,
             dpd=dpd.enabled,
-            rank=dpd.rank,
+            rank=dpd.rank if dpd.additions else 0,
+            poses=dpd.poses,
             template=settings.heads,
         )
     if subject is not None:

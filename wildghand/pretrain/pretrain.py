@@ -181,9 +181,9 @@ class JointFit(IterativeFit[tuple[dict[str, Tensor], int]]):
 
     def batches(self) -> Iterator[tuple[int, Tensor]]:
         """Which capture the next step is taken on, and on which of its frames."""
-        size, seed = self.settings.schedule.batch, self.fits[0].seed
+        seed = self.fits[0].seed
         rows = [
-            batches(len(fit.data.frames), size, seed + 1 + index)
+            batches(len(fit.data.frames), fit.batch, seed + 1 + index)
             for index, fit in enumerate(self.fits)
         ]
         for capture in batches(len(self.fits), 1, seed):

@@ -9,6 +9,7 @@ import pytest
 
 from hwp_bench.methods.contract import Budget, TrainingCapture
 from wildghand.fitting.method import affordable
+from wildghand.model.settings import read_settings
 
 
 @pytest.fixture
@@ -17,13 +18,22 @@ def training(make_training: Callable[..., TrainingCapture]) -> TrainingCapture:
 
 
 @pytest.mark.parametrize(
-    ("seconds", "kept"), [(5.0, 20), (1.0, 16), (0.0, 16), (None, 32), (8.0, 32)]
+    ("seconds", "share", "kept"),
+    [
+        (5.0, 4.0, 20),
+        (1.0, 4.0, 16),
+        (0.0, 4.0, 16),
+        (5.0, 0.0, 32),
+        (None, 4.0, 32),
+        (8.0, 4.0, 32),
+    ],
 )
 def test_frames_are_left_out_by_the_second(
-    training: TrainingCapture, seconds: float | None, kept: int
+    training: TrainingCapture, seconds: float | None, share: float, kept: int
 ) -> None:
+    settings = read_settings({"schedule.frames_per_second": share})
     assert len(training.train) == 32
-    fewer = affordable(training, Budget(seconds=seconds))
+    fewer = affordable(training, settings, Budget(seconds=seconds))
     assert len(fewer.train) == kept
     # Evenly spread: the first and the last are there, and no gap is twice another.
     assert (fewer.train[0], fewer.train[-1]) == (training.train[0], training.train[-1])
