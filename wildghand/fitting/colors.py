@@ -52,12 +52,14 @@ _COLORS = slice(CHANNELS - SIZES["logit_colors"], CHANNELS)
 _RING, _INSIDE = 4, 0.6
 # sRGB nearer to 0 or 1, and linear light below this, say nothing.
 _EDGE, _DARKEST = 0.005, 1e-3
-# Neighbours of a Gaussian, and what a squared difference from one of them, and from the same place
-# of the other hand, weighs against a squared change of a colour that is fully known.
-_NEIGHBOURS, _SMOOTH, _ALIKE = 8, 0.3, 10.0
-# How far a colour counts as known where nothing around it is filled in, and the weight of the mean
-# colour where nothing around is known either.
-_OWN, _MEAN = 1e-2, 1e-6
+# A colour that is somebody's is better than none: it takes so much less to be lent.
+_LENT = 0.25
+_OTHER = {"left": "right", "right": "left"}
+# Neighbours of a Gaussian, and what a squared difference from one of them weighs against a squared
+# change of a colour that is fully known.
+_NEIGHBOURS, _SMOOTH = 8, 0.3
+# Weight of the mean colour where nothing around is known either.
+_MEAN = 1e-6
 
 
 class StartColors(Component):
@@ -76,12 +78,12 @@ class StartColors(Component):
 
 @dataclass(eq=False)
 class FilledColors:
-    """The colours that places take which few frames have shown or none: one smooth fill.
+    """The colours that places take which few frames have shown or none.
 
     The network's colours of such places are nobody's: they began as the prior's and went where the
-    weights went that other places moved, which leaves blotches. What is known of the skin is
-    carried on to them as smoothly as can be, over edges between neighbours and, as both hands of a
-    person look alike, between the same places of two hands.
+    weights went that other places moved, which leaves blotches. Both hands of a person look alike:
+    what is known of the same place of the other hand comes first. Then what is known of the skin is
+    carried on as smoothly as can be.
     """
 
     #: Of one or two hands.
@@ -117,20 +119,21 @@ class FilledColors:
         return len(self.fit.model.rigs) == 2 and self.fit.settings.evidence.other_hand
 
     def _filled(self, levels: Mapping[str, np.ndarray], share: float) -> dict[str, np.ndarray]:
-        from scipy.sparse import block_diag
-
         half = (share or self.fit.settings.evidence.fill_share) * len(self.fit.data.frames)
-        smooth, least = (_SMOOTH, 0.0) if share > 0.0 else (0.0, _OWN)
-        found: dict[str, np.ndarray] = {}
-        for hands in [[*levels]] if self._joined else [[side] for side in levels]:
-            edges = smooth * block_diag([self._roughness[side] for side in hands])
+        found = {}
+        for side, values in levels.items():
+            known = self._kept(side, half)
             if self._joined:
-                edges = edges + _ALIKE * between_hands(edges.shape[0] // 2)
-            shown = torch.cat([self.shown[side] for side in hands]).double().cpu()
-            known = np.maximum(kept_share(shown, half).numpy(), least)
-            filled = smooth_fill(edges, np.concatenate([levels[side] for side in hands]), known)
-            found |= zip(hands, np.split(filled, len(hands)), strict=True)
+                other = _OTHER[side]
+                taken = (1.0 - known) * self._kept(other, _LENT * half)
+                values = values + taken[:, None] * (levels[other] - values)
+                known = 1.0 - (1.0 - known) * (1.0 - taken)
+            found[side] = smooth_fill(self._roughness[side], values, known) if share else values
         return found
+
+    def _kept(self, side: str, half: float) -> np.ndarray:
+        """(N,) in [0, 1), how far the colours of a hand are known."""
+        return np.asarray(kept_share(self.shown[side].double().cpu(), half))
 
     @functools.cached_property
     def _roughness(self) -> dict[str, Any]:
@@ -267,24 +270,13 @@ def roughness(rig: HandRig) -> Any:
     return diags_array(edges.sum(axis=1)) - edges
 
 
-def between_hands(count: int) -> Any:
-    """(2 N, 2 N) sparse form: the sum of squared differences between the same places of two hands.
-
-    Both hands have their Gaussians at the same places of the skin.
-    """
-    from scipy.sparse import eye_array, kron
-
-    return kron(np.array([[1.0, -1.0], [-1.0, 1.0]]), eye_array(count))
-
-
-def smooth_fill(edges: Any, values: np.ndarray, known: np.ndarray) -> np.ndarray:
+def smooth_fill(rough: Any, values: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Carry values on from where they are known to where they are not.
 
     The filled values x are smooth and near what is known: they minimise the sum of known (x - v)^2
-    + edges(x). A value keeps its own part as far as it is known, and takes the rest from x.
+    + 0.3 roughness(x). A value keeps its own part as far as it is known, and takes the rest from x.
 
     Args:
-        edges: (N, N) sparse form that is 0 where x is the same everywhere.
         values: (N, C).
         known: (N,) in [0, 1].
 
@@ -296,7 +288,7 @@ def smooth_fill(edges: Any, values: np.ndarray, known: np.ndarray) -> np.ndarray
 
     if known.sum() <= 0.0:
         return values
+    system = diags_array(known + _MEAN) + _SMOOTH * rough
     mean = known @ values / known.sum()
-    solved = splu((diags_array(known + _MEAN) + edges).tocsc())
-    found = solved.solve(known[:, None] * (values - mean)) + mean
+    found = splu(system.tocsc()).solve(known[:, None] * (values - mean)) + mean
     return np.asarray(known[:, None] * values + (1.0 - known)[:, None] * found)
