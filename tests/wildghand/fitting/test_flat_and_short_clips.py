@@ -53,7 +53,13 @@ def flat(training: TrainingCapture, colour: tuple[int, int, int]) -> TrainingCap
 
 
 @pytest.mark.parametrize(
-    "changes", [{"mode": "paper"}, {"mode": "released"}, {"prepass.enabled": False}], ids=str
+    "changes",
+    [
+        {"mode": "paper", "schedule.epochs": 1},
+        {"mode": "released", "schedule.epochs": 1},
+        {"prepass.enabled": False},
+    ],
+    ids=str,
 )
 @pytest.mark.parametrize("colour", COLOURS, ids=str)
 def test_a_clip_of_one_colour_gives_a_finite_avatar(

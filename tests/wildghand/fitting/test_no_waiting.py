@@ -161,9 +161,7 @@ def fake_fit(training: TrainingCapture, changes: dict[str, Any]) -> Fit:
         if found is not None:
             found.before(fit)
     others = {name: group for c in fit.components for name, group in c.parameters().items()}
-    fit.descent = Descent(
-        fit.model, others, settings.schedule, fit._loss_of_features, fit.epoch
-    )
+    fit.descent = Descent(fit.model, others, settings.schedule, fit._loss_of_features, fit.epoch)
     return fit
 
 
