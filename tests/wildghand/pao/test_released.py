@@ -1,4 +1,4 @@
-"""PAO and the terms of the authors' code. Oracle: small numpy forms of their lines, written anew.
+"""PAO and the terms of the authors' code. Oracle: small numpy forms of their lines, of our own.
 
 Their `train_single.py`, `train_multi.py` and `model_utils_mask_lr.py` work on float images, masks
 and lists of regions, frame by frame. Tolerance 1e-5. Each line of `WITHOUT` leaves one of theirs
