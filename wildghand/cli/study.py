@@ -132,7 +132,9 @@ _EXPLAIN_EXAMPLES = """examples:
 
 Shows what the biases took out of training frames: the frame, the hand without biases (what the
 avatar is), the hand with the frame's biases, and the difference of the two. Without --frames the
-eight frames of largest temporal weight are shown. The capture is the one that was fitted.
+eight frames of largest temporal weight are shown. The capture is the one that was fitted. Printed
+are the mean size of omega, and its rank correlation with the severity of the perturbations, where
+the capture says it: DPD disentangles what it should where the correlation is high.
 """
 
 
@@ -156,11 +158,12 @@ def do_explain(args: argparse.Namespace) -> int:
     from hwp_bench.base.images import write_image
     from hwp_bench.capture import open_capture
     from wildghand.avatar.files import load_avatar
-    from wildghand.avatar.render import explain_frames, explanation_sheet
+    from wildghand.avatar.render import explain_frames, explanation_sheet, temporal_weights
 
     check_places({"--out": args.out}, {"AVATAR": args.avatar, "CAPTURE": args.capture})
     capture = open_capture(args.capture)
-    found = explain_frames(load_avatar(args.avatar, hand=args.hand_model), capture, args.frames)
+    avatar = load_avatar(args.avatar, hand=args.hand_model)
+    found = explain_frames(avatar, capture, args.frames)
     names = {
         item.frame: ", ".join(
             kind.replace("_", " ")
@@ -171,6 +174,9 @@ def do_explain(args: argparse.Namespace) -> int:
     }
     write_image(args.out, explanation_sheet(found, names))
     print(f"{args.out}: {len(found)} frames")
+    for side, (size, rank) in temporal_weights(avatar, capture).items():
+        told = "not known" if rank is None else f"{rank:.2f}"
+        print(f"{side} hand: mean |omega| {size:.2g}, rank correlation with severity {told}")
     return 0
 
 

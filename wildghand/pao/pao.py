@@ -314,7 +314,7 @@ class PerturbationAwareWeights(nn.Module):
             silhouette: (B, H, W) bool, where the posed mesh is, whatever covers it.
             coverage: (B, H, W) of the rendering.
 
-        Source: the authors' `train_single.py` and `train_multi.py`, written anew.
+        Source: what the authors' `train_single.py` and `train_multi.py` do, in code of our own.
         """
         low, high = residual.amin(), residual.amax()
         span = high - low

@@ -55,8 +55,8 @@ def flat(training: TrainingCapture, colour: tuple[int, int, int]) -> TrainingCap
 @pytest.mark.parametrize(
     ("colour", "changes"),
     [
-        *[(COLOURS[0], {"mode": mode}) for mode in ("paper", "released")],
-        (COLOURS[2], {"mode": "paper"}),
+        *[(COLOURS[0], {"mode": mode, "schedule.epochs": 1}) for mode in ("paper", "released")],
+        (COLOURS[2], {"mode": "paper", "schedule.epochs": 1}),
         *[(colour, {"prepass.enabled": False}) for colour in COLOURS],
     ],
     ids=str,

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 import torch
 from painted import FRAMES, SilentReport
-from tiny_fits import TINY, UNJUDGED
+from tiny_fits import TINY
 
 from hwp_bench.base.errors import HwpError, MissingDependency, UsageError
 from hwp_bench.capture import Capture
@@ -39,10 +39,9 @@ SHORT: dict[str, Any] = {**TINY, "schedule.steps": 4, "schedule.batch": 2}
 VARIANTS: dict[str, dict[str, Any]] = {
     "default": {},
     # What precedes the first step is the same in all processes, and compared in the default.
-    "pay back": {**QUICK, "dpd.pay_back": 1.5},
-    # The weights compare the frames of a batch, and omega learns from their size.
+    "unjudged": QUICK,
     # Three frames in ten keep no biases: processes must draw the same chances.
-    "paper": {"mode": "paper"},
+    "paper": {"mode": "paper", "schedule.epochs": 0},
 }
 TrainingMaker = Callable[..., TrainingCapture]
 State = dict[str, torch.Tensor]
@@ -60,7 +59,7 @@ def fitted(request: Path, changes: dict[str, Any], world: World) -> tuple[State,
 
 def resumed(request: Path, world: World, state: Path) -> State:
     """Two steps, a saved state, and the rest from it."""
-    settings = read_settings({**SHORT, **VARIANTS["pay back"]})
+    settings = read_settings({**SHORT, **VARIANTS["unjudged"]})
     half, watchers = make_fit(open_request(request), settings, 0, CPU, world), Watchers(0)
 
     def save(step: int, watched: Watchers, loss: object) -> None:
@@ -120,7 +119,7 @@ def process(rank: int, ports: tuple[int, int], folder: Path) -> None:
     def work(world: World) -> int:
         request = folder / "request"
         found = {name: fitted(request, changes, world)[1] for name, changes in VARIANTS.items()}
-        found["again"] = fitted(request, VARIANTS["pay back"], world)[1]
+        found["again"] = fitted(request, VARIANTS["unjudged"], world)[1]
         found["resumed"] = resumed(request, world, folder / "state")
         check_spoiled(request, world)
         with pytest.raises(HwpError, match="process 1 of 2 starts from another state"):
@@ -189,7 +188,7 @@ def test_processes_agree_repeat_and_go_on_bit_for_bit(folder: Path) -> None:
     for name, state in first.items():
         assert all(torch.equal(value, second[name][key]) for key, value in state.items()), name
     for name in ("again", "resumed"):
-        assert all(torch.equal(v, first[name][key]) for key, v in first["pay back"].items()), name
+        assert all(torch.equal(v, first[name][key]) for key, v in first["unjudged"].items()), name
 
 
 def torchrun(arguments: list[str]) -> subprocess.CompletedProcess[str]:

@@ -33,9 +33,9 @@ from wildghand.model.settings import read_settings
 #: Settings that call other kernels, or the same ones in another way.
 VARIANTS: tuple[dict[str, Any], ...] = (
     {},
-    {"mode": "paper"},
+    {"mode": "paper", "schedule.epochs": 0},
     {"pao.variant": "binary"},
-    {"mode": "released"},
+    {"mode": "released", "schedule.epochs": 0},
     {"schedule.batch": 4},
     {"dpd.enabled": False},
     {"heads": False},
