@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 import torch
 from painted import FRAMES, SilentReport
-from tiny_fits import TINY
+from tiny_fits import TINY, UNJUDGED
 
 from hwp_bench.base.errors import HwpError, MissingDependency, UsageError
 from hwp_bench.capture import Capture
