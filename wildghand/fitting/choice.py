@@ -386,7 +386,8 @@ class StateChoice(Component):
         candidates = self.candidates
         if not candidates:
             return None
-        states: dict[int | None, list[Tensor]] = {None: self._average.now(), **self._kept}
+        states: dict[int | None, list[Tensor]] = {None: self._average.now()}
+        states.update(self._kept)
 
         def error_of(step: int | None) -> float:
             self._average.restore(states[step])

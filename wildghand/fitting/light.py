@@ -134,7 +134,8 @@ def light_samples(fit: Fit, frames: int, count: int) -> LightSamples:
                 )
             )
         first += len(rig)
-    return LightSamples(*_joined(found))
+    places, normals, light, weights = _joined(found)
+    return LightSamples(places, normals, light, weights)
 
 
 @torch.no_grad()
@@ -175,8 +176,9 @@ def shadow_samples(fit: Fit) -> LightSamples:
             )
         )
         first += len(rig)
-    *read, points, frame = _joined(found)
-    return LightSamples(*read, _free(fit, here, points, read[1], frame))
+    places, normals, light, weights, points, frame = _joined(found)
+    free = _free(fit, here, points, normals, frame)
+    return LightSamples(places, normals, light, weights, free)
 
 
 def _joined(columns: Sequence[tuple[np.ndarray, ...]]) -> list[np.ndarray]:

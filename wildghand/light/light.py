@@ -2,13 +2,13 @@
 
 E(n, v) = a + sum_k b_k v_k max(0, n . d_k), where v_k in [0, 1] is what is free of the way to
 direction d_k. It is linear in a and b, which are nowhere negative: albedo and strengths are solved
-by turns, by least squares without negative numbers. Weights fall with residuals, so that what
-objects and wrong poses do to single samples counts little.
+by turns, by least squares without negative numbers.
 
 Before a fit, `find_light` finds what casts shadows (`CastLight`): an ambient light, six walls (half
 spaces of the sky around the six axes) and a few lamps. Lamps are found one after the other
 (orthogonal matching pursuit, Pati et al. 1993): the next one is the direction which explains most
 of what is left, once the albedo has been taken out of both; then all strengths are solved again.
+Weights fall with residuals, so that what objects and wrong poses do to single samples counts little.
 
 After a fit, `fit_light` carries colours on (`KnownLight`). A camera that stands still shows normals
 of one half of the sphere; what a network says about the other half is chance. So a light with
@@ -66,6 +66,8 @@ _SAMPLES_EACH = 20
 # Of `fit_light`. Directions from which light may come; the ridge on their strengths makes them one
 # smooth light.
 _DIRECTIONS = 32
+# Turns of albedo and light.
+_TURNS = 12
 # Share of the normals that frames show at the border of what they show, where the network has
 # learnt little; it counts as unknown.
 _BORDER = 0.25
@@ -197,19 +199,19 @@ def find_light(
     """
     if not samples.suffice(_SAMPLES_EACH * (1 + len(_WALLS) + lamps)):
         return None
-    solver = _Solver(samples)
+    pursuit = _Pursuit(samples)
     sky = spread_directions(SKY)
     # The mean of a half space's cosines, so that a wall of strength 1 gives about 1.
     shares = np.maximum(sky @ _WALLS.T, 0.0) * (4.0 / SKY)
     basis = np.column_stack([np.ones(len(samples.light)), samples.falling(sky) @ shares])
-    solved = solver.solve(basis)
+    solved = pursuit.solve(basis)
     candidates = spread_directions(_CANDIDATES)
     falling = samples.falling(candidates)
     found: list[np.ndarray] = []
     while len(found) < lamps:
-        lamp, column = solver.next_lamp(candidates, falling, found, solved)
+        lamp, column = pursuit.next_lamp(candidates, falling, found, solved)
         wider = np.column_stack([basis, column])
-        trial = solver.solve(wider)
+        trial = pursuit.solve(wider)
         if trial.misfit > solved.misfit * (1.0 - _LEAST_GAIN):
             break
         found.append(lamp)
@@ -236,7 +238,24 @@ def fit_light(samples: LightSamples, *, ridge: float = 0.03) -> KnownLight | Non
         return None
     directions, weights = spread_directions(_DIRECTIONS), samples.weights
     basis = np.column_stack([np.ones(len(weights)), samples.falling(directions)])
-    strengths = _Solver(samples).solve(basis, ridge).strengths
+    _, places = np.unique(samples.places, return_inverse=True)
+    light, scale = np.maximum(samples.light, 0.0), np.sqrt(weights)
+    strengths = np.zeros(basis.shape[1])
+    strengths[0] = 1.0
+
+    def damping(normal: np.ndarray) -> np.ndarray:
+        """All but the ambient light is damped."""
+        return ridge * np.trace(normal) / len(normal) * (np.arange(len(normal)) > 0)
+
+    for _ in range(_TURNS):
+        seen = basis @ strengths
+        squares = np.bincount(places, weights * seen**2)
+        albedo = np.bincount(places, weights * light * seen) / np.maximum(squares, 1e-9)
+        # In shares of the albedo alone: what is darker than expected is not to count more, or the
+        # light that carries colours on goes astray.
+        dark = np.maximum(albedo, _NO_LIGHT)[places]
+        strengths = _solve_strengths(basis * scale[:, None], scale * light / dark, damping)
+        strengths = strengths / max(float(np.average(basis @ strengths, weights=weights)), 1e-6)
     axis = weights @ samples.normals
     length = float(np.linalg.norm(axis))
     if length < 1e-6 * weights.sum():  # normals from everywhere: nothing is unknown
@@ -265,8 +284,8 @@ class _Solved:
     misfit: float
 
 
-class _Solver:
-    """Solves for lights of given samples, at least one."""
+class _Pursuit:
+    """Solves for lights that cast shadows, of given samples, at least one."""
 
     def __init__(self, samples: LightSamples) -> None:
         self._samples = samples
@@ -276,13 +295,8 @@ class _Solver:
         # (P, M): sums over the samples of each place.
         self._sums = csr_matrix((ones, (self._place, rows)))
 
-    def solve(self, basis: np.ndarray, ridge: float = 0.0) -> _Solved:
-        """Solve albedo and strengths by turns.
-
-        Args:
-            basis: (M, C) irradiance of each part of the light, the ambient one first.
-            ridge: on all strengths but the first, in the mean size of the normal matrix's diagonal.
-        """
+    def solve(self, basis: np.ndarray) -> _Solved:
+        """Solve albedo and strengths by turns; the basis is (M, C) irradiance of each part."""
         samples, light = self._samples, self._samples.light
         strengths = 1.0 / (basis.shape[1] * np.maximum(basis.mean(axis=0), _NO_LIGHT))
         robust = np.ones(len(light))
@@ -294,12 +308,9 @@ class _Solver:
             weights = samples.weights * robust
             # In shares of what is expected, so that dark skin counts as light skin does.
             matrix = basis * (np.sqrt(weights) / irradiance)[:, None]
-            normal = matrix.T @ matrix / len(matrix)
-            right = matrix.T @ (np.sqrt(weights) * ratio) / len(matrix)
-            damping = 1e-4 * np.diag(normal) + 1e-9
-            damping[1:] += ridge * np.trace(normal) / len(normal)
-            root = np.linalg.cholesky(normal + np.diag(damping))
-            strengths = nnls(root.T, np.linalg.solve(root, right))[0]
+            strengths = _solve_strengths(
+                matrix, np.sqrt(weights) * ratio, lambda normal: 1e-4 * np.diag(normal)
+            )
             mean = np.average(basis @ strengths, weights=samples.weights)
             strengths = strengths / max(float(mean), 1e-6)
         irradiance = np.maximum(basis @ strengths, _NO_LIGHT)
@@ -353,6 +364,20 @@ class _Solver:
         """(M,) light over albedo times irradiance; the albedo is the mean at each place."""
         albedo = self._means((self._samples.light / irradiance)[:, None], weights)[:, 0]
         return self._samples.light / (np.maximum(albedo, _NO_LIGHT)[self._place] * irradiance)
+
+
+def _solve_strengths(
+    matrix: np.ndarray, target: np.ndarray, damping: Callable[[np.ndarray], np.ndarray]
+) -> np.ndarray:
+    """Strengths x >= 0, (C,), that bring (M, C) x near the (M,) target.
+
+    Args:
+        damping: from the (C, C) normal matrix to what is added to its diagonal.
+    """
+    normal = matrix.T @ matrix / len(matrix)
+    right = matrix.T @ target / len(matrix)
+    root = np.linalg.cholesky(normal + np.diag(damping(normal) + 1e-9))
+    return np.asarray(nnls(root.T, np.linalg.solve(root, right))[0])
 
 
 def spread_directions(count: int) -> np.ndarray:
