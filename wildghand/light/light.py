@@ -2,19 +2,21 @@
 
 E(n, v) = a + sum_k b_k v_k max(0, n . d_k), where v_k in [0, 1] is what is free of the way to
 direction d_k. It is linear in a and b, which are nowhere negative: albedo and strengths are solved
-by turns, by least squares without negative numbers.
+by turns.
 
 Before a fit, `find_light` finds what casts shadows (`CastLight`): an ambient light, six walls (half
 spaces of the sky around the six axes) and a few lamps. Lamps are found one after the other
 (orthogonal matching pursuit, Pati et al. 1993): the next one is the direction which explains most
 of what is left, once the albedo has been taken out of both; then all strengths are solved again.
-Weights fall with residuals, so that what objects and wrong poses do to single samples counts little.
+Weights fall with residuals, so that what objects and wrong poses do to single samples counts
+little.
 
 After a fit, `fit_light` carries colours on (`KnownLight`). A camera that stands still shows normals
 of one half of the sphere; what a network says about the other half is chance. So a light with
 nothing in its way is fitted to the colours that the network gives to normals that frames have
 shown; beyond them the network is asked for the nearest known normal, and its colour is multiplied
-by the ratio of both irradiances.
+by the ratio of both irradiances. Residuals count in shares of the albedo alone here: in shares of
+what is expected, as above, dark places decide, and novel views lose a decibel.
 """
 
 from __future__ import annotations
@@ -243,18 +245,17 @@ def fit_light(samples: LightSamples, *, ridge: float = 0.03) -> KnownLight | Non
     strengths = np.zeros(basis.shape[1])
     strengths[0] = 1.0
 
-    def damping(normal: np.ndarray) -> np.ndarray:
+    def damped(normal: np.ndarray) -> np.ndarray:
         """All but the ambient light is damped."""
-        return ridge * np.trace(normal) / len(normal) * (np.arange(len(normal)) > 0)
+        damping = ridge * np.trace(normal) / len(normal) * (np.arange(len(normal)) > 0)
+        return np.asarray(normal + np.diag(damping) + 1e-9 * np.eye(len(normal)))
 
     for _ in range(_TURNS):
         seen = basis @ strengths
         squares = np.bincount(places, weights * seen**2)
         albedo = np.bincount(places, weights * light * seen) / np.maximum(squares, 1e-9)
-        # In shares of the albedo alone: what is darker than expected is not to count more, or the
-        # light that carries colours on goes astray.
         dark = np.maximum(albedo, _NO_LIGHT)[places]
-        strengths = _solve_strengths(basis * scale[:, None], scale * light / dark, damping)
+        strengths = _solve_strengths(basis * scale[:, None], scale * light / dark, damped)
         strengths = strengths / max(float(np.average(basis @ strengths, weights=weights)), 1e-6)
     axis = weights @ samples.normals
     length = float(np.linalg.norm(axis))
@@ -309,7 +310,9 @@ class _Pursuit:
             # In shares of what is expected, so that dark skin counts as light skin does.
             matrix = basis * (np.sqrt(weights) / irradiance)[:, None]
             strengths = _solve_strengths(
-                matrix, np.sqrt(weights) * ratio, lambda normal: 1e-4 * np.diag(normal)
+                matrix,
+                np.sqrt(weights) * ratio,
+                lambda normal: normal + np.diag(1e-4 * np.diag(normal) + 1e-9),
             )
             mean = np.average(basis @ strengths, weights=samples.weights)
             strengths = strengths / max(float(mean), 1e-6)
@@ -367,16 +370,12 @@ class _Pursuit:
 
 
 def _solve_strengths(
-    matrix: np.ndarray, target: np.ndarray, damping: Callable[[np.ndarray], np.ndarray]
+    matrix: np.ndarray, target: np.ndarray, steady: Callable[[np.ndarray], np.ndarray]
 ) -> np.ndarray:
-    """Strengths x >= 0, (C,), that bring (M, C) x near the (M,) target.
-
-    Args:
-        damping: from the (C, C) normal matrix to what is added to its diagonal.
-    """
+    """Strengths x >= 0, (C,), that bring (M, C) x near the (M,) target; `steady` damps them."""
     normal = matrix.T @ matrix / len(matrix)
     right = matrix.T @ target / len(matrix)
-    root = np.linalg.cholesky(normal + np.diag(damping(normal) + 1e-9))
+    root = np.linalg.cholesky(steady(normal))
     return np.asarray(nnls(root.T, np.linalg.solve(root, right))[0])
 
 
