@@ -386,17 +386,16 @@ class StateChoice(Component):
         candidates = self.candidates
         if not candidates:
             return None
-        states: dict[int | None, list[Tensor]] = {None: self._average.now()}
-        states.update(self._kept)
+        steps: list[int | None] = [None, *candidates]
+        states = [self._average.now(), *(self._kept[step] for step in candidates)]
 
-        def error_of(step: int | None) -> float:
-            self._average.restore(states[step])
+        def error_of(row: int) -> float:
+            self._average.restore(states[row])
             return error()
 
-        several = [(step, 0.0) for step in (None, *candidates)]
-        chosen, _ = choose(several, error_of, patient=False)
+        chosen, _ = choose([(row, 0.0) for row in range(len(steps))], error_of, patient=False)
         self._average.restore(states[chosen])
-        return chosen
+        return steps[chosen]
 
     def error(self) -> float:
         """Mean squared error of the validation frames as the model draws them now."""

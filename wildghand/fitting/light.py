@@ -134,8 +134,8 @@ def light_samples(fit: Fit, frames: int, count: int) -> LightSamples:
                 )
             )
         first += len(rig)
-    places, normals, light, weights = _joined(found)
-    return LightSamples(places, normals, light, weights)
+    numbers, turned, light, weights = _joined(found)
+    return LightSamples(numbers, turned, light, weights)
 
 
 @torch.no_grad()
