@@ -204,10 +204,10 @@ class ClippedAdam(torch.optim.Adam):
                 parameter.grad = None
 
     def take_step(self, loss: Tensor) -> None:
-        """Move everything that has a gradient.
+        """Move everything that has a gradient; nothing changes where one is not finite.
 
-        Not on the CPU, nothing changes where the scalar `loss` is not finite, and nobody waits to
-        learn whether it is; on the CPU the caller knows.
+        Not on the CPU, this holds for the scalar `loss` too, and nobody waits to learn whether it
+        is; on the CPU the caller knows.
         """
         if loss.device.type == "cpu":
             self._step_compiled()
@@ -223,11 +223,13 @@ class ClippedAdam(torch.optim.Adam):
         self._tables = []
 
     def _step_on_device(self, loss: Tensor) -> None:
+        gradients = [p.grad for _, p in self._parameters() if p.grad is not None]
+        sizes = torch.stack(torch._foreach_norm(gradients, math.inf))
+        # Torch's fused kernels read it where it lies, as for a `GradScaler`, and skip the step.
+        self.found_inf = (~(loss.detach().isfinite() & sizes.isfinite().all())).float()
         if self.limit > 0.0:
             clipped = [p for group, p in self._parameters() if group.get("clipped", True)]
             torch.nn.utils.clip_grad_norm_(clipped, self.limit)
-        # Torch's fused kernels read it where it lies, as for a `GradScaler`, and skip the step.
-        self.found_inf = (~loss.detach().isfinite()).float()
         self.step()
 
     def _parameters(self) -> Iterator[tuple[dict[str, Any], Tensor]]:
@@ -316,10 +318,11 @@ class _Tables:
         worth = max(1, self._numbers // _WORTH_A_THREAD)
         jobs = even_jobs(len(pieces.owner), min(worth, thread_count(len(pieces.owner))))
         scales = np.ones(len(rates), np.float32)
+        run(add_squares, jobs, addresses, pieces, self._sums)
+        if not np.isfinite(self._sums).all():
+            return
         if limit > 0.0:
-            run(add_squares, jobs, addresses, pieces, self._sums)
             norm = math.sqrt(self._sums[clipped[pieces.owner]].sum())
-            # A norm that is not finite makes everything NaN, as in torch; the guard will see it.
             scales[clipped] = np.minimum(np.float32(1.0), limit / np.float32(norm + _LEAST_NORM))
         advance(addresses, rates, self._betas, self._factors)
         run(update, jobs, addresses, pieces, self._factors, scales, self._betas, self._epsilon)

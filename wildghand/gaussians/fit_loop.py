@@ -254,9 +254,9 @@ class Guard(Generic[Kept]):
             self._best_loss, self._best, self.step = mean, model.snapshot(), step
         return mean <= MAX_RISE * self._best_loss
 
-    def sound(self) -> bool:
-        """Whether the losses since the last window are finite; to be asked when a fit ends."""
-        return all(math.isfinite(loss) for loss in read_losses(self._losses))
+    def sound(self, model: Fitted[Kept]) -> bool:
+        """Whether the model and the losses since the last window are finite, when a fit ends."""
+        return all(map(math.isfinite, read_losses(self._losses))) and model.finite()
 
     def best(self) -> Kept:
         """The state with the lowest loss; `DidNotConverge` if there was none."""

@@ -170,7 +170,7 @@ def run_fit(
             if watchers.plateau.reached(loss):
                 fit.tell(f"The loss has stood still for {fit.plateau_steps} steps; finished early.")
                 break
-        if not watchers.guard.sound():
+        if not watchers.guard.sound(fit):
             step = _go_back(fit, watchers, step)
     return fit.finish(step, report.elapsed)
 
