@@ -138,4 +138,4 @@ class Objective:
         weights = self.weights.laplacian_scales, self.weights.laplacian_colors
         if not any(weights):
             return None
-        return attribute_roughness(self._laplacians[side], raw.concatenate(), *weights)
+        return attribute_roughness(self._laplacians[side], raw, *weights)
