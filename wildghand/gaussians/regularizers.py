@@ -191,13 +191,12 @@ def off_surface(
         scalar: the sum of squares beyond what costs nothing, of lengths in spacings, of the log of
         a width, and of opacity.
     """
-    rows = _tangents(raw.quats)
+    rows = _rotation_rows(raw.quats)
     drawn = activation(raw)
     squares = (drawn.scales / spacing).square()
     xx, yy, xy = ((squares * rows[i] * rows[j]).sum(dim=-1) for i, j in ((0, 0), (1, 1), (0, 1)))
     across = xx + yy
-    # The trace does not change when a Gaussian turns.
-    along = (squares.sum(dim=-1) - across).clamp(min=_TINY)
+    along = (squares * rows[2].square()).sum(dim=-1).clamp(min=_TINY)
     area = (xx * yy - xy * xy).clamp(min=_TINY)
     offsets = drawn.offsets / spacing
     shift = (offsets[..., :2].square().sum(dim=-1) + _TINY).sqrt()
@@ -211,9 +210,10 @@ def off_surface(
     return cost.mean()
 
 
-def _tangents(quats: Tensor) -> tuple[Tensor, Tensor]:
-    """The two rows (..., 3) of a Gaussian's rotation that lie in the skin; any length but 0."""
+def _rotation_rows(quats: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The rows (..., 3) of a Gaussian's rotation, of which two lie in the skin."""
     w, x, y, z = normalize(quats, dim=-1).unbind(-1)
     first = (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y))
     second = (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x))
-    return stack(first, dim=-1), stack(second, dim=-1)
+    third = (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y))
+    return stack(first, dim=-1), stack(second, dim=-1), stack(third, dim=-1)
