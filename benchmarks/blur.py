@@ -15,9 +15,8 @@ from functools import partial
 import numpy as np
 
 from benchmarks.simulation import SPREAD, Kind, frames_of
-from hwp_bench.base.embree import EmbreeMesh, library
-from hwp_bench.base.ray_mesh import EmbreexMesh
-from hwp_bench.metrics.psnr_ssim import decibels
+from hwp_bench.base.rays import EmbreeMesh, EmbreexMesh, library
+from hwp_bench.metrics.pixels import decibels
 from hwp_bench.sim.effects.plan import hands_at, plan
 from hwp_bench.sim.geometry.raycast import RenderCost
 from hwp_bench.sim.render.frame import carry_out, render_frame

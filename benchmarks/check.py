@@ -17,8 +17,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from benchmarks.ratio_store import STORE, Benchmark, read_store, updated, write_store
+from hwp_bench.base.console import notice
 from hwp_bench.base.errors import HwpError, UsageError
-from hwp_bench.base.progress import notice
 from hwp_bench.base.tables import Column, Table, print_table
 
 #: Measurements of a benchmark before a ratio counts as worse.

@@ -19,12 +19,12 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
 from hwp_bench.base.images import as_uint8, write_image
-from hwp_bench.base.ray_mesh import ray_mesh
-from hwp_bench.hands.parameters import Camera, HandPose
+from hwp_bench.base.rays import ray_mesh
+from hwp_bench.hands.skeleton import Camera, HandPose
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import load_avatar
-from wildghand.export.all_round import sh_basis, turned, view_turn, wrist_at_rest
 from wildghand.export.formats import ExportSettings, export
+from wildghand.export.splats import sh_basis, turned, view_turn, wrist_at_rest
 from wildghand.splat import rasterize
 
 # Sides that are drawn: degrees about the vertical, then about the horizontal.

@@ -26,8 +26,7 @@ from benchmarks.landmark_errors import kept_clip, landmark_errors
 from benchmarks.tracker_clips import clip_source, make_clip, true_hand
 from hwp_bench.cli.overrides import overrides
 from hwp_bench.hands import HandTemplate, PosedHand, load_template, pose_hand
-from hwp_bench.hands.parameters import HandParameters
-from hwp_bench.hands.skeleton import FINGERS, finger_joints
+from hwp_bench.hands.skeleton import FINGERS, HandParameters, finger_joints
 from hwp_bench.importers.video import FitSettings
 from hwp_bench.importers.video.from_video import fit_video
 from hwp_bench.methods.settings import settings_from

@@ -21,7 +21,7 @@ import numpy as np
 
 from hwp_bench.base.tables import Column, Table, to_markdown
 from hwp_bench.capture import Cameras, CaptureInfo, CaptureWriter, HandModelId, open_capture
-from hwp_bench.hands.parameters import HandParameters
+from hwp_bench.hands.skeleton import HandParameters
 
 Part = Callable[[Path, int, int], None]
 
@@ -73,7 +73,7 @@ def score(path: Path, frames: int, size: int) -> None:
     """Every frame against itself in the metrics without weights, read as it is scored."""
     from functools import partial
 
-    from hwp_bench.metrics.batch import Frame, score_frames
+    from hwp_bench.metrics.score import Frame, score_frames
 
     capture = open_capture(path)
 

@@ -19,7 +19,7 @@ from functools import lru_cache
 import numpy as np
 
 from hwp_bench.hands import HandTemplate
-from hwp_bench.hands.template import JOINT_COUNT
+from hwp_bench.hands.skeleton import JOINT_COUNT
 from hwp_bench.sim.effects.plan import hands_at
 from hwp_bench.sim.scene.motion import HandMoment, hand_parameters
 from hwp_bench.sim.scene.optics import focus_point

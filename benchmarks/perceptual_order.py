@@ -17,10 +17,9 @@ import numpy as np
 from skimage import data
 
 from hwp_bench.base.images import as_uint8
-from hwp_bench.metrics.aggregate import mean_scores
-from hwp_bench.metrics.lpips_weights import load_available
+from hwp_bench.metrics.lpips import load_available
 from hwp_bench.metrics.protocol import HWP_V1
-from hwp_bench.metrics.score import Network, score_frame
+from hwp_bench.metrics.score import Network, mean_scores, score_frame
 
 #: Side of the images and radius of the disc, px.
 SIZE, RADIUS = 256, 90

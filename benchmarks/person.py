@@ -22,9 +22,8 @@ from hwp_bench.base.drawing import labelled, sheet
 from hwp_bench.base.images import write_image
 from hwp_bench.base.tables import Column, Table, to_markdown
 from hwp_bench.capture import open_capture
-from hwp_bench.capture.schema import TRUE_TEMPLATE
+from hwp_bench.capture.schema import TRUE_TEMPLATE, read_subject_mesh
 from hwp_bench.capture.splits import contiguous_split
-from hwp_bench.capture.subject_mesh import read_subject_mesh
 from hwp_bench.hands import HandTemplate
 from hwp_bench.hands.raster import draw_faces, mix_corners
 from hwp_bench.methods.contract import Budget, RunSettings, TrainingCapture

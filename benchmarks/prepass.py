@@ -26,7 +26,7 @@ import numpy as np
 import torch
 from scipy.stats import rankdata, spearmanr
 
-from hwp_bench.base.evenly import evenly
+from hwp_bench.base.arrays import evenly
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.splits import contiguous_split
 from wildghand.prepass import (

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from hwp_bench.base.nearest import kd_tree
+from hwp_bench.base.numerics import kd_tree
 from hwp_bench.hands import HandTemplate, load_template
 from hwp_bench.hands.skeleton import PARENTS
-from hwp_bench.hands.topology import boundary_loop
+from hwp_bench.hands.template import boundary_loop
 from hwp_bench.sim.subject.joint_names import WEBXR
 
 #: Another frame and unit: turned, ten times larger, elsewhere.

@@ -19,7 +19,7 @@ import numpy as np
 from scipy import ndimage
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from hwp_bench.metrics.batch import Frame, score_frames
+from hwp_bench.metrics.score import Frame, score_frames
 
 #: Different frames that are made; the list of frames goes round them.
 DISTINCT = 16

@@ -157,7 +157,7 @@ def memory_table(size: int, workers: int) -> str:
 def penetration_table(frames: int) -> str:
     """A Markdown table of the deepest places, over gestures and over frames of the scenes, mm."""
     from benchmarks.penetration import hand_penetration, scene_penetration
-    from hwp_bench.hands.gestures import gestures
+    from hwp_bench.hands.poses import gestures
     from hwp_bench.sim.scene.motion import moment_of_key
     from hwp_bench.sim.scene.schema import HandKey
     from hwp_bench.sim.subject.hand import MOVING, scene_hands

@@ -123,7 +123,7 @@ def cost_table(people: dict[str, Subject]) -> str:
 def depth_table(people: dict[str, Subject]) -> str:
     """A Markdown table of how deep the gestures press each hand into itself, mm."""
     from benchmarks.penetration import hand_penetration
-    from hwp_bench.hands.gestures import gestures
+    from hwp_bench.hands.poses import gestures
 
     lines = ["| subject | deepest, mm | gesture |", "| --- | ---: | --- |"]
     for name, subject in people.items():

@@ -16,7 +16,7 @@ import torch
 from benchmarks.landmark_errors import LandmarkErrors
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.hands import HandTemplate, load_template, pose_hand
-from hwp_bench.hands.parameters import HandParameters
+from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.importers.video import FitSettings, VideoImport
 from hwp_bench.importers.video.from_video import fit_video
 from hwp_bench.importers.video.source import VideoSource, read_source

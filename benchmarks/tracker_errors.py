@@ -27,9 +27,8 @@ from benchmarks.landmark_errors import LandmarkErrors, landmark_errors, real_cli
 from benchmarks.tracker_clips import FPS, RoundTrip, round_trip
 from hwp_bench.capture import open_capture
 from hwp_bench.hands import load_template
-from hwp_bench.hands.parameters import HandParameters
-from hwp_bench.hands.posed_skeleton import hand_extent, posed_skeleton, rest_skeleton, turned
-from hwp_bench.hands.skeleton import JOINT_NAMES
+from hwp_bench.hands.poses import hand_extent, posed_skeleton, rest_skeleton, turned
+from hwp_bench.hands.skeleton import JOINT_NAMES, HandParameters
 from hwp_bench.importers.shared.landmarks import LANDMARK_NAMES
 from hwp_bench.sim.produce.tracker import GAIN, parameter_errors
 from hwp_bench.sim.produce.tracker_geometry import curl

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from hwp_bench.base.lazy_names import lazy_names
-from hwp_bench.base.threads import wait_passively
-from hwp_bench.base.version import __version__
+from hwp_bench.base.numerics import wait_passively
+from hwp_bench.base.packages import __version__, lazy_names
 
 if TYPE_CHECKING:
     from hwp_bench.api import compare as compare

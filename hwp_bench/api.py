@@ -14,9 +14,8 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from hwp_bench.analysis.statistics.comparison import Comparison, compare_results
-from hwp_bench.base.arguments import of_type, place, whole_number
-from hwp_bench.base.errors import UsageError
-from hwp_bench.base.progress import JobsView, notice
+from hwp_bench.base.console import JobsView, notice
+from hwp_bench.base.errors import UsageError, of_type, place, whole_number
 from hwp_bench.capture import Capture
 from hwp_bench.evaluation.evaluate import EvaluationSettings, default_folder
 from hwp_bench.evaluation.evaluate import evaluate as evaluate_method

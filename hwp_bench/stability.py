@@ -18,8 +18,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 
-from hwp_bench.base.errors import HwpError, MissingDependency, UsageError
-from hwp_bench.base.text import did_you_mean
+from hwp_bench.base.errors import HwpError, MissingDependency, UsageError, did_you_mean
 
 #: Entry-point group of functions that return cases.
 ENTRY_POINTS = "hwp_bench.stability"

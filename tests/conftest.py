@@ -46,7 +46,7 @@ def machine_code(tmp_path_factory: pytest.TempPathFactory) -> None:
     """Everything is compiled that tests need, by the first of the workers that asks for it."""
     from own_cache import compile_all
 
-    from hwp_bench.base.locks import exclusive
+    from hwp_bench.base.folders import exclusive
 
     # All workers' temporary folders lie in one.
     shared = tmp_path_factory.getbasetemp().parent if WORKER else tmp_path_factory.getbasetemp()

@@ -20,8 +20,8 @@ def states() -> dict[str, bool]:
     import numpy as np
     import torch
 
-    from hwp_bench.base.compiled import compiled
-    from hwp_bench.base.denormals import flushes
+    from hwp_bench.base.kernels import compiled
+    from hwp_bench.base.numerics import flushes
 
     @compiled()
     def halves(values: np.ndarray) -> float:

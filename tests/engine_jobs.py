@@ -9,8 +9,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from hwp_bench.base.console import JobsView
 from hwp_bench.base.errors import BadInput
-from hwp_bench.base.progress import JobsView
 from hwp_bench.run.engine import Folder, Job, Needs
 from hwp_bench.run.engine.job import OnProgress
 

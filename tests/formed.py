@@ -12,7 +12,7 @@ from hwp_bench.base.images import as_uint8
 from hwp_bench.capture import Capture, CaptureWriter
 from hwp_bench.capture.reader import open_capture
 from hwp_bench.capture.splits import contiguous_split
-from hwp_bench.hands.parameters import HandParameters
+from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.methods.contract import Avatar, Budget, HandPose, RunSettings, TrainingCapture
 from hwp_bench.methods.request import open_request, write_request
 

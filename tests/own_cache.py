@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 
 from hwp_bench.base.files import cache_root
-from hwp_bench.base.machine_code import code_folder
+from hwp_bench.base.kernels import code_folder
 
 
 def compile_all() -> None:

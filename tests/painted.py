@@ -13,7 +13,7 @@ from hwp_bench.base.images import as_uint8
 from hwp_bench.capture import Cameras, Capture, CaptureInfo, CaptureWriter, HandModelId
 from hwp_bench.capture.reader import open_capture
 from hwp_bench.hands import load_template
-from hwp_bench.hands.parameters import HandParameters
+from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.methods.contract import Avatar, Camera, HandPose, TrainingCapture
 from wildghand.plain.avatar import PlainAvatar
 from wildghand.plain.model import make_model

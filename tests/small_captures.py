@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from hwp_bench.capture import Cameras, Capture, HandModelId, identify_hand_model
-from hwp_bench.hands.parameters import HandParameters
+from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.results import CaptureResult, CurvePoint, FrameResult, MethodId, Results
 
 CaptureMaker = Callable[..., Capture]

@@ -13,7 +13,7 @@ import pytest
 
 from benchmarks.patience import run
 from hwp_bench.base.files import cache_root
-from hwp_bench.base.locks import exclusive
+from hwp_bench.base.folders import exclusive
 
 #: The versions that the tests were written for.
 PACKAGES = ("@playcanvas/splat-transform@2.7.1", "gltf-validator@2.0.0-dev.3.10")

@@ -13,7 +13,7 @@ import torch
 from hwp_bench.hands import HandParameters, HandTemplate, load_template, pose_hand
 from hwp_bench.hands.articulation import joint_axes
 from hwp_bench.hands.raster import draw_silhouette
-from hwp_bench.hands.topology import boundary_vertices
+from hwp_bench.hands.template import boundary_vertices
 from hwp_bench.importers.shared.landmarks import Landmarks
 from hwp_bench.importers.video import FitSettings
 

@@ -10,7 +10,7 @@ import pytest
 from benchmarks.importer_errors import changed, hand_errors
 from benchmarks.tracker_clips import KINDS, scene_text
 from hwp_bench.hands import load_template
-from hwp_bench.hands.parameters import HandParameters
+from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.importers.video import FitSettings
 from hwp_bench.sim.scene.reader import parse_scene
 from hwp_bench.sim.scene.subject_anatomy import SubjectAnatomy

@@ -9,8 +9,8 @@ from small_captures import CaptureMaker
 from benchmarks.landmark_errors import RealClip, landmark_errors
 from benchmarks.tracker_errors import correlation, gathered, habit, main, pose_error
 from hwp_bench.hands import load_template
-from hwp_bench.hands.parameters import HandParameters
-from hwp_bench.hands.posed_skeleton import posed_skeleton, rest_skeleton, turned
+from hwp_bench.hands.poses import posed_skeleton, rest_skeleton, turned
+from hwp_bench.hands.skeleton import HandParameters
 
 
 def _hand(frames: int) -> HandParameters:

@@ -186,8 +186,7 @@ def test_what_draws_on_terminals_has_its_place() -> None:
         for path in (ROOT / package).rglob("*.py")
         if re.search(r"^\s*(from|import) rich\b", path.read_text("utf-8"), re.MULTILINE)
     }
-    shown = {"hwp_bench/base/progress.py", "hwp_bench/base/stages_view.py"}
-    assert users == {"hwp_bench/base/tables.py", *shown}
+    assert users == {"hwp_bench/base/tables.py", "hwp_bench/base/console.py"}
 
 
 def test_what_a_stream_refuses_does_not_stop_the_work(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,7 +13,7 @@ from hwp_bench.base.colors import linear_to_srgb
 from hwp_bench.capture import Capture
 from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.hands import SurfaceAnchors, anchor_uv, load_template
-from hwp_bench.hands.parameters import HandParameters
+from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.methods.contract import Budget, RunSettings, TrainingCapture
 from hwp_bench.methods.request import open_request, write_request
 from hwp_bench.sim.scene.schema import Subject

@@ -13,6 +13,7 @@ OccluderMethod  # the entry of baselines/occluder-splats/method.toml
 ScanMethod  # the entry of baselines/scan-texture/method.toml
 SpaceMethod  # the entry of baselines/texture-space/method.toml
 ShadowMethod  # the entry of baselines/shadow-albedo/method.toml
+write_splits  # writes what `read_splits` reads; benchmarks and organizers call it
 OneShotMethod  # the entry of baselines/one-shot-prior/method.toml
 WildGHandMethod  # the entry of wildghand/method.toml and of baselines/network-scratch
 check_networks  # `check_files` of wildghand/method.toml and of baselines/network-scratch
@@ -47,4 +48,3 @@ _.hidden_deviation  # the table CUES names it; getattr reads it
 _.found_inf  # torch's fused Adam reads it
 REACH_X  # a row of the rasterizer's records, named for the order of the rows
 _.thread_type  # the decoder reads how it may share its work
-_.on_broken_pipe  # rich calls it

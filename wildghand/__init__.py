@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from hwp_bench.base.lazy_names import lazy_names
+from hwp_bench.base.packages import lazy_names
 
 if TYPE_CHECKING:
     from wildghand.avatar.avatar import WildGHandAvatar as WildGHandAvatar

@@ -14,7 +14,7 @@ import numpy as np
 
 from hwp_bench.capture import Capture
 from hwp_bench.capture.splits import Split
-from hwp_bench.hands.footprint import Footprint, HandSurfaces
+from hwp_bench.hands.anchors import Footprint, HandSurfaces
 from hwp_bench.metrics.pixels import hand_pixels
 
 #: Edge of a cell, m.

@@ -17,11 +17,12 @@ from hwp_bench.metrics.pixels import (
     check_prediction,
     check_truth,
     composite,
+    decibels,
     hand_pixels,
     scored_pixels,
+    squared_error,
 )
 from hwp_bench.metrics.protocol import HWP_V1
-from hwp_bench.metrics.psnr_ssim import decibels, squared_error
 
 #: A pixel of a prediction shows something if a channel is above this; methods draw over black.
 LIT = 12

@@ -8,12 +8,16 @@ import os
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hwp_bench.base.errors import BadInput
+from hwp_bench.base.errors import BadInput, shown
 from hwp_bench.base.files import atomic_write, check_is_file
-from hwp_bench.base.text import shown
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
 
 #: Largest array file that is read, unpacked, in bytes (a zip can unpack to a thousand times).
 MAX_NPZ_BYTES = 1024 * 1024 * 1024
@@ -131,3 +135,50 @@ def take(
         row = int(np.unravel_index(np.abs(array).argmax(), array.shape)[0]) if array.ndim else 0
         raise BadInput(f"holds a number beyond {most:g} (row {row})", where=where, field=name)
     return array
+
+
+def read_tensors(path: str | os.PathLike[str], max_bytes: int) -> dict[str, Tensor]:
+    """Read tensors by name; nothing else that a file may hold is made or run.
+
+    Args:
+        path: a `.safetensors` file, or a checkpoint of torch, in its present format (then tensors
+            stay on the disk until they are used) or its former one.
+        max_bytes: largest file that is read.
+
+    Raises:
+        BadInput: it is missing, larger, cannot be read, or is not a table of tensors.
+    """
+    import torch
+
+    file = Path(path)
+    check_is_file(file)
+    if file.stat().st_size > max_bytes:
+        raise BadInput(f"is larger than {max_bytes} bytes", where=file)
+    try:
+        if file.suffix == ".safetensors":
+            from safetensors.torch import load_file
+
+            return load_file(file)
+        mapped = zipfile.is_zipfile(file)
+        loaded = torch.load(file, map_location="cpu", weights_only=True, mmap=mapped)
+    # A damaged file may raise anything in its reader.
+    except Exception as error:
+        text = (str(error).splitlines() or [""])[0][:200]
+        raise BadInput(f"cannot be read ({type(error).__name__}: {text})", where=file) from error
+    if not isinstance(loaded, dict) or not all(isinstance(name, str) for name in loaded):
+        raise BadInput("is not a table of parameters", where=file)
+    return {name: value for name, value in loaded.items() if isinstance(value, torch.Tensor)}
+
+
+def evenly(count: int, most: int) -> np.ndarray:
+    """Choose among things in a row, from the first to the last.
+
+    Args:
+        count: how many there are, not negative.
+        most: how many are chosen at most, not negative; with 1 it is the first.
+
+    Returns:
+        (K,) int64, their numbers, ascending and all different; all of them where `count` is not
+        larger than `most`.
+    """
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))

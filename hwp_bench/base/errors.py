@@ -7,8 +7,15 @@ that reaches a user is a bug of ours.
 
 from __future__ import annotations
 
+import difflib
+import math
+import numbers
+import operator
 import os
-from typing import ClassVar
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
 
 
 class HwpError(Exception):
@@ -115,3 +122,138 @@ class MissingDependency(HwpError):
 
 class DidNotConverge(HwpError):
     """An optimization left the range of finite or sensible values."""
+
+
+#: Control characters except tab and line feed, the marks that reverse the direction of writing,
+#: and halves of surrogate pairs, which no file can hold as UTF-8; as a set of characters in a
+#: regular expression (without its brackets).
+ODD_CHARACTERS = r"\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff"
+_ODD = re.compile(f"[{ODD_CHARACTERS}]")
+
+
+def bounded(items: Sequence[object], most: int = 12) -> str:
+    """Return items separated by commas, at most some of them, and how many more there are."""
+    text = ", ".join(str(item) for item in items[:most])
+    return text if len(items) <= most else f"{text} and {len(items) - most} more"
+
+
+def nearest(wrong: str, known: Iterable[str], *, most: int = 1, cutoff: float = 0.6) -> list[str]:
+    """Return the known names that are most like a wrong one, the closest first; often none.
+
+    Args:
+        wrong: what was given.
+        known: the names that there are.
+        most: how many are returned at most.
+        cutoff: how alike they must be, from 0 to 1.
+    """
+    return difflib.get_close_matches(wrong[:200], list(known), n=most, cutoff=cutoff)
+
+
+def did_you_mean(wrong: str, known: Iterable[str], *, cutoff: float = 0.6) -> str:
+    """Return `Did you mean 'NAME'?` of the nearest known name; empty where none is near."""
+    near = nearest(wrong, known, cutoff=cutoff)
+    return f"Did you mean {near[0]!r}?" if near else ""
+
+
+def has_odd_characters(text: str) -> bool:
+    """Whether a text holds one of `ODD_CHARACTERS`."""
+    return _ODD.search(text) is not None
+
+
+def is_unicode(text: str) -> bool:
+    """Whether a text can be written as UTF-8: it holds no half of a surrogate pair."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def check_name(path: str | os.PathLike[str]) -> None:
+    """Refuse the name of a file or folder that is not UTF-8.
+
+    Libraries that read and write files in C++ take such a name for another one.
+
+    Raises:
+        UsageError: the name holds bytes that are not UTF-8.
+    """
+    text = os.fspath(path)
+    if not is_unicode(text):
+        raise UsageError("is not UTF-8", where=shown(text), remedy="Rename the file or folder.")
+
+
+def shown(text: str) -> str:
+    """Return a text that can be printed on a terminal: odd characters become `?`."""
+    return _ODD.sub("?", text)
+
+
+def one_line(text: str, most: int = 1000) -> str:
+    """Return a text as a record keeps it: one line without odd characters, of bounded length."""
+    return shown(text[:most]).replace("\n", " ")
+
+
+def whole_number(value: Any, field: str) -> int:
+    """Return an integer of Python or NumPy as Python's.
+
+    Raises:
+        UsageError: it is of another type, a boolean too.
+    """
+    if not isinstance(value, bool):
+        try:
+            return operator.index(value)
+        except TypeError:
+            pass
+    raise _wrong(value, field, "an integer")
+
+
+def real_number(value: Any, field: str) -> float:
+    """Return a finite number of Python or NumPy as Python's.
+
+    Raises:
+        UsageError: it is of another type, a boolean too, or not finite.
+    """
+    if isinstance(value, numbers.Real) and not isinstance(value, bool):
+        try:
+            number = float(value)
+        except OverflowError:
+            number = math.inf
+        if math.isfinite(number):
+            return number
+    raise _wrong(value, field, "a finite number")
+
+
+def place(value: Any, field: str) -> Path:
+    """Return a path that is given as text or as a path.
+
+    Raises:
+        UsageError: it is of another type, empty, or holds a zero byte.
+    """
+    if isinstance(value, str | os.PathLike):
+        text = os.fspath(value)
+        if isinstance(text, str) and text and "\0" not in text:
+            return Path(text)
+    raise _wrong(value, field, "a path")
+
+
+def of_type(value: Any, kinds: type | tuple[type, ...], field: str, expected: str) -> Any:
+    """Return an argument that is of one of some types.
+
+    Args:
+        value: the argument.
+        kinds: the types.
+        field: its name.
+        expected: what these types are, for the message.
+
+    Raises:
+        UsageError: it is of another type.
+    """
+    if isinstance(value, kinds):
+        return value
+    raise _wrong(value, field, expected)
+
+
+def _wrong(value: Any, field: str, expected: str) -> UsageError:
+    plain = value is None or isinstance(value, str | bytes | int | float)
+    text = repr(value)[:60] if plain else ""
+    given = f"{shown(text)} ({type(value).__name__})" if text else f"a {type(value).__name__}"
+    return UsageError(f"is {given}, not {expected}", field=field)

@@ -17,8 +17,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from hwp_bench.base.errors import BadInput, HwpError, UsageError, reason_of
-from hwp_bench.base.text import is_unicode, shown
+from hwp_bench.base.errors import BadInput, HwpError, UsageError, is_unicode, reason_of, shown
 
 #: Largest JSON file that is read, in bytes; a result of 10,000 frames stays far below it.
 MAX_JSON_BYTES = 256 * 1024 * 1024

@@ -5,15 +5,18 @@ from __future__ import annotations
 import csv
 import io
 import json
+import shutil
 import sys
-from collections.abc import Mapping
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import groupby, product
 from pathlib import Path
 from typing import Any
 
-from hwp_bench.base.console import encoding_of
+from hwp_bench.base.console import encoding_of, expressed, on_terminal
 from hwp_bench.base.files import atomic_write
-from hwp_bench.base.terminal_tables import WIDTH, table_lines
 
 #: Formats of a table by file ending.
 FORMATS = ("md", "tex", "csv", "json")
@@ -273,6 +276,13 @@ def to_object(table: Table) -> dict[str, Any]:
     }
 
 
+def write_tables(folder: Path, tables: Mapping[str, Table]) -> None:
+    """Write every table in every format: `overall.md`, `overall.tex`, ..."""
+    for name, table in tables.items():
+        for ending in FORMATS:
+            atomic_write(folder / f"{name}.{ending}", format_table(table, ending))
+
+
 def print_table(table: Table, width: int | None = None) -> None:
     """Print a table on standard output: styled on a terminal, plain text elsewhere.
 
@@ -282,27 +292,215 @@ def print_table(table: Table, width: int | None = None) -> None:
         table: the table.
         width: in characters; None takes that of the terminal, `COLUMNS`, or 80.
     """
-    import shutil
+    width = width or shutil.get_terminal_size((_WIDTH, 24)).columns
+    styled = on_terminal(sys.stdout)
+    print(draw_table(table, width, styled=styled, encoding=encoding_of(sys.stdout)), end="")
 
+
+def draw_table(table: Table, width: int, *, styled: bool = False, encoding: str = "utf-8") -> str:
+    """Return a table as it stands on a terminal.
+
+    The columns that name a row stand in front of every block of the others. Columns of one group
+    stay together where they fit. Texts are folded; numbers never are.
+
+    Args:
+        table: the table.
+        width: in characters; a table whose narrowest form is wider is drawn wider.
+        styled: with the codes of a terminal; without them a character marks best values.
+        encoding: what it lacks is said in ASCII.
+    """
     from rich.console import Console
-    from rich.text import Text
 
-    class Output(Console):
-        def on_broken_pipe(self) -> None:
-            # Of rich's own it would be the end of the program, with status 1.
-            raise
-
-    width = width or shutil.get_terminal_size((WIDTH, 24)).columns
-    console = Output(width=width)
-    encoding = encoding_of(sys.stdout)
-    for line in table_lines(table, width, marks=not console.is_terminal, encoding=encoding):
-        whole = Text.assemble(*line.pieces)
-        whole.rstrip()
-        console.print(whole, no_wrap=True, overflow="ignore", crop=False)
+    drawing = _Drawing(table, width, "" if styled else _BEST, encoding)
+    widest = max(_total(drawing.widths, columns) for columns in drawing.blocks())
+    console = Console(
+        width=max(width, widest), force_terminal=styled, highlight=False, file=io.StringIO()
+    )
+    with console.capture() as drawn:
+        for part in drawing.parts():
+            console.print(part)
+    return "".join(f"{line.rstrip()}\n" for line in drawn.get().splitlines())
 
 
-def write_tables(folder: Path, tables: Mapping[str, Table]) -> None:
-    """Write every table in every format: `overall.md`, `overall.tex`, ..."""
-    for name, table in tables.items():
-        for ending in FORMATS:
-            atomic_write(folder / f"{name}.{ending}", format_table(table, ending))
+#: Columns where no terminal says how wide it is.
+_WIDTH = 80
+#: Spaces between two columns.
+_GAP = 2
+#: Narrowest that a column of text is folded to, and widest that one keeps if others lack space.
+_FOLDED = (12, 24)
+#: Marks the best value where nothing can be bold.
+_BEST = "*"
+_STYLES = {0: "bold", 1: "underline", None: ""}
+
+
+def _total(widths: Sequence[int], columns: Sequence[int]) -> int:
+    """The width of some columns side by side."""
+    return sum(widths[index] for index in columns) + _GAP * (len(columns) - 1)
+
+
+class _Drawing:
+    """A table in characters that an encoding has, cut into blocks that fit a width."""
+
+    def __init__(self, table: Table, width: int, mark: str, encoding: str) -> None:
+        self.fit = partial(expressed, encoding=encoding)
+        self.table = table
+        self.width = width
+        self.mark = mark
+        #: Of all cells, as they are printed.
+        self.cells = [
+            [self._cell(row, column) for column in range(len(table.columns))]
+            for row in range(len(table.rows))
+        ]
+        self.headings = [self.fit(column.heading) for column in table.columns]
+        self.numbers = [
+            any(isinstance(cells[index], int | float) for cells in table.rows)
+            for index in range(len(table.columns))
+        ]
+        #: How many columns name a row: all before the first with a measurement.
+        self.keys = 1
+        for index, column in enumerate(table.columns):
+            measured = any(isinstance(cells[index], float) for cells in table.rows)
+            if measured or column.higher_is_better is not None or column.group:
+                self.keys = max(index, 1)
+                break
+        self.widths = self._widths()
+
+    def parts(self) -> Iterator[Any]:
+        """What `rich` prints: the caption, the blocks, and what is said under them."""
+        from rich.text import Text
+
+        yield Text(self.fit(self.table.caption), "italic")
+        for number, columns in enumerate(self.blocks()):
+            yield from [""] if number else []
+            yield from self._block(columns)
+        notes = [self.fit(note) for note in self.table.notes]
+        ranked = any(column.higher_is_better is not None for column in self.table.columns)
+        if ranked and self.fit("↑") != "↑":
+            notes.append(f"{self.fit('↑')} higher is better, {self.fit('↓')} lower is better.")
+        everything = product(range(len(self.cells)), range(len(self.headings)))
+        if self.mark and any(self.table.rank(*place) == 0 for place in everything):
+            notes.append(f"{self.mark} the best of the rows on the same data.")
+        yield from (Text(note, "dim") for note in notes)
+
+    def blocks(self) -> list[list[int]]:
+        """The columns of each block: those that name the rows, and as many others as fit."""
+        names = list(range(self.keys))
+        rest = range(self.keys, len(self.table.columns))
+        found: list[list[int]] = [names]
+        for _, unit in groupby(rest, key=lambda i: self.table.columns[i].group or i):
+            together = list(unit)
+            fits = _total(self.widths, [*names, *together]) <= self.width
+            for piece in [together] if fits else [[index] for index in together]:
+                if found[-1] != names and _total(self.widths, [*found[-1], *piece]) > self.width:
+                    found.append(names)
+                found[-1] = [*found[-1], *piece]
+        return found
+
+    def _cell(self, row: int, column: int) -> str:
+        text = self.fit(self.table.text(row, column))
+        if not self.mark or self.table.columns[column].higher_is_better is None:
+            return text
+        return text + (self.mark if self.table.rank(row, column) == 0 else " ")
+
+    def _widths(self) -> list[int]:
+        """The width of each column; texts are folded where not all fit, numbers never."""
+        least, most = _FOLDED
+        natural = [
+            max([1, *map(len, heading.split()), *(len(cells[index]) for cells in self.cells)])
+            for index, heading in enumerate(self.headings)
+        ]
+        self.widths = natural
+        everything = range(len(natural))
+        # Those that name rows are folded until all fits, or until they leave half to numbers.
+        for limit in range(most, least - 1, -1):
+            if _total(self.widths, everything) <= self.width:
+                return self.widths
+            self.widths = [
+                min(width, limit) if index < self.keys and not self.numbers[index] else width
+                for index, width in enumerate(natural)
+            ]
+            if _total(self.widths, everything[: self.keys]) <= self.width // 2:
+                break
+        # A name that fits a line stays whole, so that it can be copied; prose is folded.
+        room = max(self.width - _total(self.widths, everything[: self.keys]) - _GAP, most)
+        for index in everything[self.keys :]:
+            if not self.numbers[index] and natural[index] > min(room, 2 * most):
+                self.widths[index] = min(room, max(most, self.width // 2))
+        return self.widths
+
+    def _block(self, columns: Sequence[int]) -> Iterator[Any]:
+        """The line that names groups of columns, if there are any; heading, rule and rows."""
+        from rich.box import Box
+        from rich.table import Table as RichTable
+        from rich.text import Text
+
+        widths = self._spread(columns)
+        rule = self.fit("─")
+        if any(self.table.columns[index].group for index in columns):
+            yield self._groups(columns, widths, rule)
+        lines = ["    "] * 8
+        lines[2] = lines[4] = rule * 4
+        box = Box("\n".join(lines), ascii=True)
+        space = (0, _GAP - 1, 0, 0)
+        grid = RichTable(
+            box=box, show_edge=False, pad_edge=False, padding=space, header_style="bold"
+        )
+        for index in columns:
+            heading = Text(self.headings[index], justify="right" if self.numbers[index] else "left")
+            grid.add_column(heading, width=widths[index], overflow="fold")
+        for row, cells in enumerate(self._rows(columns, widths)):
+            if row in self.table.breaks:
+                grid.add_section()
+            ranks = [self.table.rank(row, index) for index in columns]
+            grid.add_row(*(Text(c, _STYLES[r]) for c, r in zip(cells, ranks, strict=True)))
+        yield grid
+
+    def _spread(self, columns: Sequence[int]) -> list[int]:
+        """Widen the last column of each group whose name has a longer word, if there is room."""
+        widths = list(self.widths)
+        for group, run in groupby(columns, key=lambda i: self.table.columns[i].group):
+            members = list(run)
+            lacks = max(map(len, group.split()), default=0) - _total(widths, members)
+            if 0 < lacks <= self.width - _total(widths, columns):
+                widths[members[-1]] += lacks
+        return widths
+
+    def _groups(self, columns: Sequence[int], widths: Sequence[int], rule: str) -> Any:
+        """The names of groups over a block, centred in a rule where there is room for one."""
+        from rich.rule import Rule
+        from rich.table import Table as RichTable
+        from rich.text import Text
+
+        line = RichTable.grid(padding=(0, _GAP, 0, 0))
+        cells: list[Any] = []
+        for group, run in groupby(columns, key=lambda i: self.table.columns[i].group):
+            name, span = self.fit(group), _total(widths, list(run))
+            line.add_column(width=span, justify="center", vertical="bottom")
+            ruled = name and len(name) + 4 <= span
+            cells.append(Rule(name, characters=rule, style="bold") if ruled else Text(name, "bold"))
+        line.add_row(*cells)
+        return line
+
+    def _rows(self, columns: Sequence[int], widths: Sequence[int]) -> list[list[str]]:
+        """The cells of each row, numbers to the right.
+
+        Where blocks of rows begin with the same texts, a text stands once and flows down over the
+        rows that repeat it. The last column that names rows is always printed.
+        """
+        found = [
+            [c[i].rjust(widths[i]) if self.numbers[i] else c[i] for i in columns]
+            for c in self.cells
+        ]
+        edges = [*self.table.breaks, len(found)] if self.table.breaks else []
+        for place in range(self.keys - 1):
+            start = 0
+            for edge in edges:
+                block = range(start, edge)
+                for _, run in groupby(block, key=lambda row: self.cells[row][: place + 1]):
+                    rows = list(run)
+                    left = textwrap.wrap(found[rows[0]][place], widths[place])
+                    for row in rows:
+                        here = left if row == rows[-1] else left[:1]
+                        found[row][place], left = "\n".join(here), left[1:]
+                start = edge
+        return found

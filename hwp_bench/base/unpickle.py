@@ -21,9 +21,8 @@ from typing import Any, cast
 
 import numpy as np
 
-from hwp_bench.base.errors import BadInput, HwpError, UnsafePickle
+from hwp_bench.base.errors import BadInput, HwpError, UnsafePickle, shown
 from hwp_bench.base.files import check_is_file
-from hwp_bench.base.text import shown
 
 #: Largest pickle that is read, in bytes; MANO has 4 MB, a released HWP capture some 100 MB.
 MAX_PICKLE_BYTES = 1024 * 1024 * 1024

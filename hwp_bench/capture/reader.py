@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hwp_bench.base.arguments import place, whole_number
-from hwp_bench.base.errors import BadCapture, BadInput, HwpError, UsageError
+from hwp_bench.base.errors import BadCapture, BadInput, HwpError, UsageError, place, whole_number
 from hwp_bench.base.files import read_json, sha256_json
 from hwp_bench.base.images import read_gray, read_rgb
 from hwp_bench.capture.schema import (
@@ -23,14 +22,16 @@ from hwp_bench.capture.schema import (
     SIDES,
     TRUE_HANDS,
     TRUE_TEMPLATE,
+    Cameras,
     CaptureInfo,
     HandModelId,
     image_path,
+    read_cameras,
+    read_hands,
+    read_subject_mesh,
 )
-from hwp_bench.capture.subject_mesh import read_subject_mesh
-from hwp_bench.capture.tracks import Cameras, read_cameras, read_hands
-from hwp_bench.hands.parameters import Camera, HandParameters, HandPose, hand_poses
-from hwp_bench.hands.template_sources import load_template
+from hwp_bench.hands.skeleton import Camera, HandParameters, HandPose, hand_poses
+from hwp_bench.hands.sources import load_template
 
 if TYPE_CHECKING:
     from hwp_bench.hands.template import HandTemplate

@@ -22,18 +22,16 @@ from hwp_bench.capture.schema import (
     HANDS,
     METADATA,
     TRUE_HANDS,
-    CaptureInfo,
-    check_id,
-    image_path,
-)
-from hwp_bench.capture.tracks import (
     Cameras,
+    CaptureInfo,
     arrays_digest,
+    check_id,
     hand_arrays,
+    image_path,
     write_cameras,
     write_hands,
 )
-from hwp_bench.hands.parameters import HandParameters
+from hwp_bench.hands.skeleton import HandParameters
 
 
 class CaptureWriter:

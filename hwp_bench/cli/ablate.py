@@ -87,8 +87,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
+    from hwp_bench.base.console import JobsView, notice
     from hwp_bench.base.errors import UsageError
-    from hwp_bench.base.progress import JobsView, notice
     from hwp_bench.capture.splits import read_splits
     from hwp_bench.cli.evaluate import chosen_captures, evaluation_settings, look_ahead
     from hwp_bench.evaluation.ablate.design import make_design
@@ -132,7 +132,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _report(ablation: AblationRuns, out: Path, *, print_json: bool) -> int:
     from hwp_bench.analysis.statistics.pairing import common_metrics
-    from hwp_bench.base.progress import notice
+    from hwp_bench.base.console import notice
     from hwp_bench.base.tables import print_table, write_tables
     from hwp_bench.evaluation.ablate.ablation_tables import (
         ablation_record,
@@ -172,8 +172,8 @@ def _report(ablation: AblationRuns, out: Path, *, print_json: bool) -> int:
 
 def _draw(ablation: AblationRuns, out: Path) -> None:
     from hwp_bench.analysis.cost.analysis import analyse_cost
+    from hwp_bench.base.console import notice
     from hwp_bench.base.errors import UsageError
-    from hwp_bench.base.progress import notice
     from hwp_bench.report.figures import write_cost
 
     try:

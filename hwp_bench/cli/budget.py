@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
-    from hwp_bench.base.progress import JobsView, notice
+    from hwp_bench.base.console import JobsView, notice
     from hwp_bench.capture.splits import read_splits
     from hwp_bench.cli.evaluate import chosen_captures, evaluation_settings, look_ahead
     from hwp_bench.evaluation.budget.runs import check_truths, run_budget
@@ -88,9 +88,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _report(runs: BudgetRuns, out: Path, *, print_json: bool) -> int:
+    from hwp_bench.base.console import notice
     from hwp_bench.base.files import write_json
     from hwp_bench.base.images import write_image
-    from hwp_bench.base.progress import notice
     from hwp_bench.base.tables import print_table, write_tables
     from hwp_bench.evaluation.budget.budget import budget_tables, make_budget, next_work
     from hwp_bench.evaluation.budget.picture import budget_sheet

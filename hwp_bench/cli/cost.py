@@ -55,9 +55,9 @@ def run(args: argparse.Namespace) -> int:
 
     from hwp_bench.analysis.cost.analysis import CostAnalysis, analyse_cost
     from hwp_bench.analysis.statistics.pairing import group_runs
+    from hwp_bench.base.console import notice
     from hwp_bench.base.errors import UsageError
     from hwp_bench.base.files import check_places
-    from hwp_bench.base.progress import notice
     from hwp_bench.base.tables import print_table
     from hwp_bench.metrics import metric
     from hwp_bench.report.data_groups import DataGroup, data_groups, data_key

@@ -9,7 +9,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from hwp_bench.capture.splits.audit import AuditReport
+    from hwp_bench.capture.splits import AuditReport
 
 _EXAMPLES = """examples:
   hwp-bench data audit my_capture
@@ -34,8 +34,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
+    from hwp_bench.base.console import track
     from hwp_bench.base.errors import UsageError
-    from hwp_bench.base.progress import track
     from hwp_bench.capture import open_capture
     from hwp_bench.capture.splits import audit_split, contiguous_split, read_splits, split_for
 

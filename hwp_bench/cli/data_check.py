@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
-    from hwp_bench.base.progress import track
+    from hwp_bench.base.console import track
     from hwp_bench.capture.check import check_capture
 
     reports = [check_capture(path) for path in track(args.captures, "checking captures")]
@@ -42,8 +42,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _print(report: CheckReport) -> None:
+    from hwp_bench.base.errors import shown
     from hwp_bench.base.tables import Column, Table, print_table
-    from hwp_bench.base.text import shown
 
     title = shown(report.path)
     verdict = "sound" if report.ok else "NOT SOUND"

@@ -38,8 +38,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
+    from hwp_bench.base.console import JobsView, notice
     from hwp_bench.base.files import check_places
-    from hwp_bench.base.progress import JobsView, notice
     from hwp_bench.importers.official.download import HuggingFaceHub, download_release
 
     check_places({"--out": args.out}, {})

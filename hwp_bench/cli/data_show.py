@@ -32,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.base.files import check_places
     from hwp_bench.base.images import write_image
     from hwp_bench.capture import open_capture
-    from hwp_bench.capture.sheet import contact_sheet
+    from hwp_bench.capture.check import contact_sheet
 
     if args.count < 1 or not 16 <= args.edge <= 2048:
         raise UsageError("at least one frame, of 16 to 2048 px, is drawn", field="--count, --edge")

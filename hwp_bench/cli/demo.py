@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
-    from hwp_bench.base.progress import JobsView, notice
+    from hwp_bench.base.console import JobsView, notice
     from hwp_bench.base.tables import Column, Table, print_table, write_tables
     from hwp_bench.capture import open_capture
     from hwp_bench.cli.evaluate import report_outcome

@@ -136,7 +136,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the command."""
     from dataclasses import asdict, replace
 
-    from hwp_bench.base.progress import JobsView
+    from hwp_bench.base.console import JobsView
     from hwp_bench.base.tables import print_table
     from hwp_bench.capture.splits import read_splits
     from hwp_bench.evaluation.evaluate import default_folder, evaluate
@@ -215,8 +215,8 @@ def _sealed_part(args: argparse.Namespace) -> SealedPart | None:
     """Open the sealed part that is asked for, and print its commitment."""
     if args.sealed is None:
         return None
+    from hwp_bench.base.console import notice
     from hwp_bench.base.errors import UsageError
-    from hwp_bench.base.progress import notice
     from hwp_bench.publish import open_sealed
 
     if args.capture or args.splits:
@@ -228,7 +228,7 @@ def _sealed_part(args: argparse.Namespace) -> SealedPart | None:
 
 def report_outcome(out: Path, results: Results) -> int:
     """Print where the results are and which frames failed; returns the exit status."""
-    from hwp_bench.base.progress import notice
+    from hwp_bench.base.console import notice
     from hwp_bench.evaluation.outcome import outcome_lines
 
     for line in outcome_lines(out, results):

@@ -31,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the command."""
     from hwp_bench.base.files import check_places
     from hwp_bench.capture import open_capture
-    from hwp_bench.capture.meshes import hand_meshes, write_meshes
+    from hwp_bench.capture.convert import hand_meshes, write_meshes
 
     check_places({"FILE": args.out}, {"CAPTURE": args.capture})
     meshes = hand_meshes(open_capture(args.capture), args.frame, truth=args.truth)

@@ -87,8 +87,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
+    from hwp_bench.base.console import notice
     from hwp_bench.base.files import check_places
-    from hwp_bench.base.progress import notice
     from hwp_bench.importers.video import (
         VideoImport,
         finished_import,

@@ -56,8 +56,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
+    from hwp_bench.base.console import notice
     from hwp_bench.base.files import check_places
-    from hwp_bench.base.progress import notice
     from hwp_bench.importers.official import OfficialImport, import_official
     from hwp_bench.importers.official.folders import find_folders
 

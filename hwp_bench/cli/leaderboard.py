@@ -208,7 +208,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _add(args: argparse.Namespace, folder: Path) -> int:
-    from hwp_bench.base.progress import notice
+    from hwp_bench.base.console import notice
     from hwp_bench.leaderboard.soundness import check_source
     from hwp_bench.leaderboard.submit import add_entry
     from hwp_bench.results import read_results, results_among
@@ -221,8 +221,8 @@ def _add(args: argparse.Namespace, folder: Path) -> int:
 
 
 def _submit(args: argparse.Namespace, folder: Path) -> int:
+    from hwp_bench.base.console import notice
     from hwp_bench.base.files import check_places
-    from hwp_bench.base.progress import notice
     from hwp_bench.leaderboard.soundness import check_source, sound_entries
     from hwp_bench.leaderboard.submit import TEXT, submit
     from hwp_bench.report.sources import read_sources, source_folders
@@ -268,8 +268,7 @@ def _submission(args: argparse.Namespace) -> Submission:
 
 def _check_line(option: str, text: str) -> None:
     """Refuse what an entry cannot hold: it would be written, and then not be read."""
-    from hwp_bench.base.errors import UsageError
-    from hwp_bench.base.text import has_odd_characters, shown
+    from hwp_bench.base.errors import UsageError, has_odd_characters, shown
 
     if len(text) > _LINE or "\n" in text or has_odd_characters(text):
         raise UsageError(
@@ -322,8 +321,8 @@ def _show(args: argparse.Namespace, folder: Path) -> int:
 def _confirm(args: argparse.Namespace, folder: Path) -> int:
     from dataclasses import asdict
 
+    from hwp_bench.base.console import notice
     from hwp_bench.base.errors import UsageError
-    from hwp_bench.base.progress import notice
     from hwp_bench.cli.verify import captures_of
     from hwp_bench.leaderboard.confirm import confirm, entry_of
     from hwp_bench.leaderboard.entries import refuse_installed, write_check
@@ -363,8 +362,8 @@ def _confirm(args: argparse.Namespace, folder: Path) -> int:
 
 
 def _register(args: argparse.Namespace, folder: Path) -> int:
+    from hwp_bench.base.console import notice
     from hwp_bench.base.errors import UsageError
-    from hwp_bench.base.progress import notice
     from hwp_bench.leaderboard.entries import refuse_installed
     from hwp_bench.leaderboard.names import NAME, register
     from hwp_bench.leaderboard.soundness import readable_entries
@@ -380,8 +379,8 @@ def _register(args: argparse.Namespace, folder: Path) -> int:
 
 
 def _build(args: argparse.Namespace, folder: Path) -> int:
+    from hwp_bench.base.console import notice
     from hwp_bench.base.files import check_places
-    from hwp_bench.base.progress import notice
     from hwp_bench.leaderboard.site import build_site
     from hwp_bench.leaderboard.soundness import sound_entries
     from hwp_bench.report.sources import read_sources, source_folders

@@ -6,9 +6,8 @@ import tomllib
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from hwp_bench.base.errors import UsageError
-from hwp_bench.base.text import has_odd_characters, shown
-from hwp_bench.base.toml_text import parse_toml
+from hwp_bench.base.errors import UsageError, has_odd_characters, shown
+from hwp_bench.base.records import parse_toml
 
 # Deepest table that a dotted name leads to.
 _MOST_TABLES = 8

@@ -14,11 +14,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from hwp_bench.base.console import in_utf8_mode, settle, standard_streams, tell
-from hwp_bench.base.denormals import flushed_process
-from hwp_bench.base.errors import HwpError
-from hwp_bench.base.text import check_name, nearest
-from hwp_bench.base.threads import check_thread_variables, share_processors
-from hwp_bench.base.version import __version__
+from hwp_bench.base.errors import HwpError, check_name, nearest
+from hwp_bench.base.numerics import check_thread_variables, flushed_process, share_processors
+from hwp_bench.base.packages import __version__
 
 
 @dataclass(frozen=True)

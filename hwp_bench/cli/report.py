@@ -54,8 +54,8 @@ def run(args: argparse.Namespace) -> int:
     """Run the command."""
     from pathlib import Path
 
+    from hwp_bench.base.console import notice
     from hwp_bench.base.files import check_places
-    from hwp_bench.base.progress import notice
     from hwp_bench.report.page.mixed import write_reports
     from hwp_bench.report.sources import read_sources, source_folders
 

@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command; 1 if anything that must hold does not."""
-    from hwp_bench.base.progress import notice
+    from hwp_bench.base.console import notice
     from hwp_bench.stability import find_cases, run_cases
 
     cases = find_cases(args.group, args.provider)

@@ -49,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the command."""
     from dataclasses import asdict
 
-    from hwp_bench.base.progress import track
+    from hwp_bench.base.console import track
     from hwp_bench.capture.splits import read_splits
     from hwp_bench.evaluation.verify import verify_results
     from hwp_bench.results import result_files

@@ -11,8 +11,8 @@ import numpy as np
 
 from hwp_bench.base.drawing import error_map, fitted, labelled, sheet
 from hwp_bench.base.files import atomic_write
+from hwp_bench.base.folders import remove_tree
 from hwp_bench.base.images import write_image
-from hwp_bench.base.trees import remove_tree
 from hwp_bench.capture import Capture
 from hwp_bench.capture.schema import frame_name
 from hwp_bench.evaluation.scoring import MAX_PREDICTION_BYTES, Prediction

@@ -8,15 +8,13 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
-from hwp_bench.base.errors import BadMethod, HwpError, MethodFailed
+from hwp_bench.base.errors import BadMethod, HwpError, MethodFailed, bounded, one_line, shown
 from hwp_bench.base.files import disc_errors, read_json, write_json
+from hwp_bench.base.folders import remove_tree, scratch_folder
 from hwp_bench.base.packages import PACKAGES
 from hwp_bench.base.records import MAX_TEXT, parse_record
-from hwp_bench.base.scratch import scratch_folder
-from hwp_bench.base.text import bounded, one_line, shown
-from hwp_bench.base.trees import remove_tree
 from hwp_bench.capture import Capture, open_capture
-from hwp_bench.capture.content import refuse_changed
+from hwp_bench.capture.check import refuse_changed
 from hwp_bench.capture.schema import EXTRA, IMAGE_FOLDERS
 from hwp_bench.capture.splits import Split
 from hwp_bench.evaluation.artifacts import keep_artifacts
@@ -42,7 +40,7 @@ from hwp_bench.methods.manifest import MethodManifest, read_manifest
 from hwp_bench.methods.request import write_request
 from hwp_bench.methods.setting_files import ships
 from hwp_bench.metrics import PROTOCOLS
-from hwp_bench.metrics.lpips_weights import load_available
+from hwp_bench.metrics.lpips import load_available
 from hwp_bench.metrics.score import Network
 from hwp_bench.results import CaptureResult, CurvePoint
 from hwp_bench.results.walls import WALLED
@@ -216,7 +214,7 @@ def _refuse_changed(evaluation: CaptureEvaluation) -> None:
     """Refuse a capture, or a clip in it, whose content is not that of the digests.
 
     Raises:
-        BadCapture, BadImage: as `hwp_bench.capture.content.refuse_changed`.
+        BadCapture, BadImage: as `hwp_bench.capture.check.refuse_changed`.
     """
     clean = evaluation.run.frames != FRAME_CHOICES[0]
     for capture in (evaluation.capture, evaluation.capture.free_view):

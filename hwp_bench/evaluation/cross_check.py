@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from hwp_bench.base.evenly import evenly
+from hwp_bench.base.arrays import evenly
 from hwp_bench.base.images import as_float
 from hwp_bench.metrics.protocol import HWP_V1, Protocol
 

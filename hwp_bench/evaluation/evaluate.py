@@ -7,12 +7,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
-from hwp_bench.base.errors import BadCapture, BadMethod
-from hwp_bench.base.locks import exclusive
-from hwp_bench.base.progress import notice
+from hwp_bench.base.console import notice
+from hwp_bench.base.errors import BadCapture, BadMethod, one_line
+from hwp_bench.base.folders import exclusive
+from hwp_bench.base.packages import __version__
 from hwp_bench.base.records import check_json_values, merged, parse_record
-from hwp_bench.base.text import one_line
-from hwp_bench.base.version import __version__
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.splits import Split, split_for
 from hwp_bench.evaluation.capture_evaluation import (
@@ -29,7 +28,7 @@ from hwp_bench.methods.contract import FRAME_CHOICES, RunSettings
 from hwp_bench.methods.manifest import MethodManifest, find_method, read_manifest
 from hwp_bench.methods.setting_files import find_setting_files
 from hwp_bench.metrics import PROTOCOLS
-from hwp_bench.metrics.lpips_weights import load_available
+from hwp_bench.metrics.lpips import load_available
 from hwp_bench.metrics.score import Network
 from hwp_bench.results import CaptureResult, MethodId, Results
 from hwp_bench.results.environment import environment

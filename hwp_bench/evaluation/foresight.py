@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from hwp_bench.base.console import notice
 from hwp_bench.base.errors import BadMethod, HwpError, UsageError
 from hwp_bench.base.files import Places, check_places, inside
-from hwp_bench.base.locks import exclusive
-from hwp_bench.base.progress import notice
+from hwp_bench.base.folders import exclusive
 from hwp_bench.capture.splits import Split, split_for
 from hwp_bench.evaluation.evaluate import EvaluationSettings, make_plan, with_setting_files
 from hwp_bench.evaluation.results_folder import refuse_other

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from hwp_bench.base.arrays import evenly
 from hwp_bench.base.drawing import fitted, labelled, sheet
-from hwp_bench.base.evenly import evenly
 from hwp_bench.base.images import write_image
 from hwp_bench.capture import Capture
 from hwp_bench.evaluation.artifacts import keep_predictions

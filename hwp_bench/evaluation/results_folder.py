@@ -18,13 +18,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from hwp_bench.base.errors import HwpError, UsageError
+from hwp_bench.base.console import notice
+from hwp_bench.base.errors import HwpError, UsageError, bounded
 from hwp_bench.base.files import canonical_json, disc_errors, temporary_name
-from hwp_bench.base.progress import notice
+from hwp_bench.base.folders import remove_tree
 from hwp_bench.base.records import flattened
 from hwp_bench.base.tables import FORMATS, write_tables
-from hwp_bench.base.text import bounded
-from hwp_bench.base.trees import remove_tree
 from hwp_bench.evaluation.capture_evaluation import (
     RESULT,
     CaptureEvaluation,

@@ -14,15 +14,13 @@ from pathlib import Path
 
 import numpy as np
 
-from hwp_bench.base.errors import BadCapture, BadPrediction, HwpError
+from hwp_bench.base.errors import BadCapture, BadPrediction, HwpError, bounded
 from hwp_bench.base.images import MAX_PIXELS, pixel_digest, read_rgb
-from hwp_bench.base.text import bounded
 from hwp_bench.capture import Capture
 from hwp_bench.capture.schema import frame_name
-from hwp_bench.metrics.batch import Frame, score_frames
 from hwp_bench.metrics.pixels import scored_pixels
 from hwp_bench.metrics.protocol import HWP_V1
-from hwp_bench.metrics.score import Network
+from hwp_bench.metrics.score import Frame, Network, score_frames
 from hwp_bench.results import FrameResult
 
 #: Bytes of a predicted frame: the largest image that is read, four channels, not packed.

@@ -14,7 +14,7 @@ from typing import Any
 
 from hwp_bench.base.errors import BadSplit, HwpError
 from hwp_bench.base.files import inside, read_json, sha256_json
-from hwp_bench.base.version import __version__
+from hwp_bench.base.packages import __version__
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.check import check_capture
 from hwp_bench.capture.splits import Split, split_for
@@ -40,7 +40,7 @@ from hwp_bench.evaluation.scoring import (
     score_predictions,
 )
 from hwp_bench.metrics import METRICS, PROTOCOLS, metric_names
-from hwp_bench.metrics.lpips_weights import load_available
+from hwp_bench.metrics.lpips import load_available
 from hwp_bench.metrics.score import Network
 from hwp_bench.results import CaptureResult, FrameResult, Results, read_results
 from hwp_bench.results.bounds import MAX_BYTES

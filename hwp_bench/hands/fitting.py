@@ -9,13 +9,12 @@ import numpy as np
 import torch
 
 from hwp_bench.base.errors import BadInput, DidNotConverge
-from hwp_bench.base.nearest import kd_tree
+from hwp_bench.base.numerics import kd_tree
 from hwp_bench.hands.anchors import vertex_normals
 from hwp_bench.hands.articulation import anatomical_limits, joint_limit_penalty
-from hwp_bench.hands.parameters import HandParameters
+from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.hands.skinning import PosedHand, only_fingertips, pose_hand
-from hwp_bench.hands.template import HandTemplate, TemplateTensors
-from hwp_bench.hands.topology import boundary_vertices
+from hwp_bench.hands.template import HandTemplate, TemplateTensors, boundary_vertices
 
 #: Points farther from the fitted surface than this have no effect, m.
 REACH = 0.03

@@ -15,10 +15,10 @@ import torch
 from torch import Tensor
 
 from hwp_bench.base.errors import BadInput
-from hwp_bench.hands.rotations import axis_angle_to_matrix
+from hwp_bench.hands.articulation import axis_angle_to_matrix
 from hwp_bench.hands.skinning import PosedHand, pose_hand, project
+from hwp_bench.hands.sources import load_template
 from hwp_bench.hands.template import TemplateTensors
-from hwp_bench.hands.template_sources import load_template
 from hwp_bench.stability import Case, Context, Measured
 
 #: Largest distance of a vertex from its oracle, m, in float64 and in float32.

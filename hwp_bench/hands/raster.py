@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hwp_bench.base.compiled import compiled
+from hwp_bench.base.kernels import compiled
 
 # Faces with a corner nearer to the camera than this, m, are left out.
 _NEAR = 1e-3

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import torch
 
 from hwp_bench.base.errors import BadInput, ShapeMismatch
-from hwp_bench.hands.rotations import axis_angle_to_matrix
-from hwp_bench.hands.skeleton import landmark_order
-from hwp_bench.hands.template import JOINT_COUNT, SHAPE_COUNT, TemplateTensors
+from hwp_bench.hands.articulation import axis_angle_to_matrix
+from hwp_bench.hands.skeleton import JOINT_COUNT, SHAPE_COUNT, landmark_order
+from hwp_bench.hands.template import TemplateTensors
 
 # The joints at each distance from the wrist, one of each finger; every template has this tree.
 _LEVELS = (slice(1, None, 3), slice(2, None, 3), slice(3, None, 3))

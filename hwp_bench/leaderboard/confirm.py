@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from hwp_bench.base.errors import BadResult, UsageError
-from hwp_bench.base.version import __version__
+from hwp_bench.base.packages import __version__
 from hwp_bench.evaluation.verify import verify_results
 from hwp_bench.leaderboard.entries import Entry, digest
 from hwp_bench.leaderboard.records import Check

@@ -12,7 +12,7 @@ from hwp_bench.leaderboard.entries import Entry
 from hwp_bench.leaderboard.records import LEVELS
 from hwp_bench.leaderboard.rules import takes_over
 from hwp_bench.leaderboard.severity_scopes import at_severity, suite_severities
-from hwp_bench.metrics.aggregate import CaptureScores, aggregate
+from hwp_bench.metrics.score import CaptureScores, aggregate
 from hwp_bench.results.schema import score_rows
 from hwp_bench.taxonomy import PERTURBATIONS, perturbation
 

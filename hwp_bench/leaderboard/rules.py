@@ -14,9 +14,9 @@ from hwp_bench.leaderboard.names import is_shipped
 from hwp_bench.leaderboard.records import LEVELS
 from hwp_bench.leaderboard.suite_data import on_current_data
 from hwp_bench.metrics import HWP_V1, PROTOCOLS
-from hwp_bench.metrics.aggregate import aggregate
+from hwp_bench.metrics.score import aggregate
 from hwp_bench.results.schema import score_rows
-from hwp_bench.taxonomy.suites import SUITES as ALL_SUITES
+from hwp_bench.taxonomy import SUITES as ALL_SUITES
 
 #: Suites whose captures are the same everywhere. `wild-dev` is for tuning.
 SUITES = tuple(name for name in ALL_SUITES if name != "wild-dev")

@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import cache
 
 from hwp_bench.capture.splits import split_for
-from hwp_bench.metrics.aggregate import CaptureScores
+from hwp_bench.metrics.score import CaptureScores
 from hwp_bench.sim.produce.suites import suite
 from hwp_bench.sim.scene.episodes import moments, severity
 

@@ -12,9 +12,9 @@ from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
+from hwp_bench.base.console import notice
 from hwp_bench.base.errors import BadResult, HwpError, UsageError
 from hwp_bench.base.files import read_json
-from hwp_bench.base.progress import notice
 from hwp_bench.evaluation.bindings import Discrepancy, copy_differences, digest_differences
 from hwp_bench.evaluation.capture_evaluation import RESULT
 from hwp_bench.evaluation.completeness import wrong_labels

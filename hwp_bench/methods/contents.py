@@ -11,7 +11,7 @@ from pathlib import Path
 
 from hwp_bench.base.errors import BadInput, BadMethod
 from hwp_bench.base.files import sha256_of
-from hwp_bench.base.locks import LOCK
+from hwp_bench.base.folders import LOCK
 
 #: Folders that do not count, at any depth: what version control, Python and editors make again.
 #: A method behind walls finds them empty, so that nothing that decides a score can lie there.

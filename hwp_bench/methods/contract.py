@@ -12,25 +12,25 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
 import numpy as np
 from msgspec import Meta
 
-from hwp_bench.base.arguments import of_type, real_number, whole_number
-from hwp_bench.base.errors import BadInput, UsageError
-from hwp_bench.base.evenly import evenly
+from hwp_bench.base.arrays import evenly
+from hwp_bench.base.errors import BadInput, UsageError, of_type, real_number, whole_number
 from hwp_bench.base.images import read_gray, read_rgb
-from hwp_bench.base.record_types import brief
-from hwp_bench.base.records import MAX_COUNT, MAX_SECONDS, MAX_SEED, Line, Seed
+from hwp_bench.base.records import MAX_COUNT, MAX_SECONDS, MAX_SEED, Line, Seed, brief
 from hwp_bench.capture.schema import (
     CAMERAS,
     FREE_VIEW,
     HANDS,
     MAX_FRAMES,
     SIDES,
+    Cameras,
     FrameRate,
     HandModelId,
     image_path,
+    read_cameras,
+    read_hands,
 )
 from hwp_bench.capture.splits import Split
-from hwp_bench.capture.tracks import Cameras, read_cameras, read_hands
-from hwp_bench.hands.parameters import Camera, HandParameters, HandPose, hand_poses
+from hwp_bench.hands.skeleton import Camera, HandParameters, HandPose, hand_poses
 
 if TYPE_CHECKING:
     from hwp_bench.hands.template import HandTemplate
@@ -315,7 +315,7 @@ class TrainingCapture:
                 own is damaged.
         """
         from hwp_bench.capture.reader import load_matching_template
-        from hwp_bench.capture.subject_mesh import read_subject_mesh
+        from hwp_bench.capture.schema import read_subject_mesh
 
         if side not in self.sides:
             raise UsageError(f"this capture has no {side} hand", where=self.root)

@@ -11,20 +11,20 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
-from hwp_bench.base.errors import BadMethod, UsageError
+from hwp_bench.base.console import notice
+from hwp_bench.base.errors import BadMethod, UsageError, nearest
 from hwp_bench.base.files import inside
 from hwp_bench.base.packages import PACKAGES, data_folder
-from hwp_bench.base.progress import notice
 from hwp_bench.base.records import (
     Line,
     check_json_values,
     flattened,
     parse_record,
+    parse_toml,
     without_schema,
 )
-from hwp_bench.base.text import nearest
-from hwp_bench.base.toml_text import parse_toml
 from hwp_bench.methods.contents import method_digest
+from hwp_bench.methods.settings import class_settings
 from hwp_bench.taxonomy import SIZED_LIKE
 
 #: Version of the method contract.
@@ -54,6 +54,13 @@ _SwitchName = Annotated[
 ]
 _SettingName = Annotated[
     str, _matching(r"[A-Za-z_]\w{0,63}(\.[A-Za-z_]\w{0,63}){0,7}", "a name of a setting")
+]
+_SettingsItem = Annotated[
+    str,
+    _matching(
+        r"[A-Za-z_]\w{0,63}(\.[A-Za-z_]\w{0,63}){0,7}(:[A-Za-z_]\w{0,63})?",
+        "a name of a setting, or module:Class",
+    ),
 ]
 _KindName = Annotated[str, _matching(r"[a-z][a-z0-9-]{0,31}", "a word of letters and digits")]
 _SwitchSettings = Annotated[
@@ -273,6 +280,8 @@ def read_manifest(path: str | os.PathLike[str]) -> MethodManifest:
     authors = fields.get("authors")
     if isinstance(authors, list) and all(isinstance(name, str) for name in authors):
         fields["authors"] = ", ".join(authors)
+    if isinstance(fields.get("settings"), str):
+        fields["settings"] = [fields["settings"]]
     table = parse_record(_Manifest, fields, where=where, error=BadMethod)
     kind, entry = table.entry.given[0]
     if table.entry.predictions is not None:
@@ -291,7 +300,7 @@ def read_manifest(path: str | os.PathLike[str]) -> MethodManifest:
         authors=table.authors,
         licence=table.licence,
         url=table.url,
-        settings=tuple(table.settings),
+        settings=_setting_names(root, table.settings),
         files={name: tuple(kinds) for name, kinds in table.files.items()},
         check_files=table.check_files or "",
     )
@@ -302,6 +311,13 @@ def read_manifest(path: str | os.PathLike[str]) -> MethodManifest:
         manifest.check_setting_names(switch.settings, f"switches.{name}")
     _check_crossed(manifest, where)
     return manifest
+
+
+def _setting_names(root: Path, items: list[str]) -> tuple[str, ...]:
+    """Return the names of settings; an item `module:Class` stands for the fields of a dataclass."""
+    return tuple(
+        name for item in items for name in (class_settings(root, item) if ":" in item else [item])
+    )
 
 
 def _check_crossed(manifest: MethodManifest, where: Path) -> None:
@@ -388,7 +404,7 @@ class _Manifest:
     authors: Line = ""
     licence: Line = ""
     url: Line = ""
-    settings: list[_SettingName] = field(default_factory=list)
+    settings: list[_SettingsItem] = field(default_factory=list)
     files: dict[_SettingName, list[_KindName]] = field(default_factory=dict)
     check_files: _PythonEntry | None = None
     presets: dict[str, dict[str, Any]] = field(default_factory=dict)

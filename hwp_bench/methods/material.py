@@ -17,7 +17,7 @@ import numpy as np
 from hwp_bench.base.errors import UsageError
 from hwp_bench.capture.schema import IMAGE_FOLDERS
 from hwp_bench.capture.splits import Split
-from hwp_bench.hands.parameters import HandParameters
+from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.methods.contract import FRAME_CHOICES
 
 if TYPE_CHECKING:

@@ -19,10 +19,16 @@ from hwp_bench.base.errors import BadInput
 from hwp_bench.base.files import atomic_folder, read_json, write_json
 from hwp_bench.base.images import read_gray, read_rgb
 from hwp_bench.base.records import parse_record, without_schema
-from hwp_bench.capture.schema import CAMERAS, FREE_VIEW, HANDS, image_path
+from hwp_bench.capture.schema import (
+    CAMERAS,
+    FREE_VIEW,
+    HANDS,
+    image_path,
+    write_cameras,
+    write_hands,
+    write_subject_mesh,
+)
 from hwp_bench.capture.splits import Split
-from hwp_bench.capture.subject_mesh import write_subject_mesh
-from hwp_bench.capture.tracks import write_cameras, write_hands
 from hwp_bench.methods.contract import (
     REQUEST,
     TEMPLATE,

@@ -6,8 +6,18 @@ This package loads nothing heavy; import the arithmetic from the module that doe
 
 from __future__ import annotations
 
-from hwp_bench.metrics.protocol import HWP_V1, PAPER_WILDGHAND, PROTOCOLS, Protocol, protocol
-from hwp_bench.metrics.table import METRICS, Metric, metric, metric_names, penalty
+from hwp_bench.metrics.protocol import (
+    HWP_V1,
+    METRICS,
+    PAPER_WILDGHAND,
+    PROTOCOLS,
+    Metric,
+    Protocol,
+    metric,
+    metric_names,
+    penalty,
+    protocol,
+)
 
 __all__ = [
     "HWP_V1",

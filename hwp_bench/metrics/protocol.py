@@ -6,11 +6,11 @@ that a number can be traced to the settings that made it.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-from hwp_bench.base.errors import UsageError
-from hwp_bench.base.text import did_you_mean
+from hwp_bench.base.errors import UsageError, did_you_mean
 
 #: Score of identical images, in dB; keeps means finite.
 PSNR_CAP = 100.0
@@ -105,3 +105,121 @@ def protocol(name: str) -> Protocol:
     names = [candidate.name for candidate in PROTOCOLS]
     hint = did_you_mean(name, names) or f"There are: {', '.join(names)}."
     raise UsageError(f"no protocol is called {name!r}", field="protocol", remedy=hint)
+
+
+@dataclass(frozen=True)
+class Metric:
+    """The facts of a metric."""
+
+    #: Key in results; unique over all protocols.
+    name: str
+    #: Heading in tables.
+    label: str
+    #: Name of the protocol that defines it.
+    protocol: str
+    #: Unit; empty for a plain number.
+    unit: str
+    #: True where a larger value means a better image.
+    higher_is_better: bool
+    #: Smallest and largest value that a frame can get; None where there is no bound.
+    range: tuple[float, float | None]
+    #: Value that a failed frame is given.
+    penalty: float
+    #: Digits after the decimal point that tables print.
+    digits: int
+    #: Where the formula comes from.
+    reference: str
+    #: What it measures, in one line.
+    description: str
+    #: The LPIPS backbone whose weights the user must have; None for weight-free metrics.
+    weights: str | None = None
+
+    @property
+    def perfect(self) -> float:
+        """The score of identical images."""
+        low, high = self.range
+        return low if not self.higher_is_better or high is None else high
+
+
+def _psnr(name: str, label: str, description: str, protocol: Protocol = HWP_V1) -> Metric:
+    reference = "-10 log10(mean squared error), data range 1"
+    spread = (0.0, PSNR_CAP)
+    return Metric(name, label, protocol.name, "dB", True, spread, 0.0, 2, reference, description)
+
+
+def _ssim(name: str, label: str, description: str, protocol: Protocol = HWP_V1) -> Metric:
+    reference = "Wang et al., Image quality assessment, IEEE TIP 13(4), 2004"
+    spread = (-1.0, 1.0)
+    return Metric(name, label, protocol.name, "", True, spread, 0.0, 4, reference, description)
+
+
+def _lpips(
+    name: str, label: str, net: str, description: str, protocol: Protocol = HWP_V1
+) -> Metric:
+    reference = "Zhang et al., The unreasonable effectiveness of deep features, CVPR 2018, v0.1"
+    spread = (0.0, None)
+    return Metric(
+        name, label, protocol.name, "", False, spread, 1.0, 4, reference, description, net
+    )
+
+
+#: In the order in which tables show them.
+METRICS: tuple[Metric, ...] = (
+    _psnr("psnr", "PSNR", "Error on the pixels that the hand covers fully."),
+    _ssim("ssim", "SSIM", "Gaussian 11/1.5, mean over the scored pixels of the hand."),
+    Metric(
+        "oriented_distance",
+        "Oriented distance",
+        HWP_V1.name,
+        "",
+        False,
+        (0.0, 1.0),
+        1.0,
+        4,
+        "docs/protocol.md; filters of Freeman and Adelson, IEEE TPAMI 13(9), 1991",
+        "Weight-free perceptual distance: normalised oriented energies on four scales.",
+    ),
+    _lpips("lpips_alex", "LPIPS (alex)", "alex", "AlexNet features on the padded box."),
+    _lpips("lpips_vgg", "LPIPS (vgg)", "vgg", "VGG-16 features on the padded box."),
+    _psnr("psnr_full", "PSNR (full)", "The whole frame, black outside the scored pixels."),
+    _psnr("psnr_box", "PSNR (box)", "The padded box, black outside the scored pixels."),
+    _psnr("psnr_edge", "PSNR (edge)", "The hand with its mixed border pixels."),
+    _ssim("ssim_full", "SSIM (full)", "As SSIM, mean over the whole black-padded frame."),
+    _psnr("paper_psnr", "PSNR", "The whole frame, black outside the mask.", PAPER_WILDGHAND),
+    _ssim("paper_ssim", "SSIM", "Uniform 7x7, data range 2, on the mask's box.", PAPER_WILDGHAND),
+    _lpips("paper_lpips", "LPIPS", "alex", "AlexNet features on the mask's box.", PAPER_WILDGHAND),
+)
+
+
+def metric(name: str) -> Metric:
+    """The facts of the metric of that name.
+
+    Raises:
+        UsageError: there is none; the message offers the nearest name.
+    """
+    for candidate in METRICS:
+        if candidate.name == name:
+            return candidate
+    hint = did_you_mean(name, [candidate.name for candidate in METRICS]) or None
+    raise UsageError(f"no metric is called {name!r}", field="metric", remedy=hint)
+
+
+def metric_names(
+    protocols: Iterable[Protocol] = PROTOCOLS, networks: Iterable[str] = ()
+) -> tuple[str, ...]:
+    """Names of the metrics that `protocols` give, in table order.
+
+    Args:
+        protocols: the protocols to score in.
+        networks: the LPIPS backbones at hand ("alex", "vgg"); without one its metric is absent.
+    """
+    names = {chosen.name for chosen in protocols}
+    available = {None, *networks}
+    return tuple(m.name for m in METRICS if m.protocol in names and m.weights in available)
+
+
+def penalty(
+    protocols: Iterable[Protocol] = PROTOCOLS, networks: Iterable[str] = ()
+) -> dict[str, float]:
+    """The declared scores of a frame that failed, for the metrics of `metric_names`."""
+    return {name: metric(name).penalty for name in metric_names(protocols, networks)}

@@ -1,15 +1,26 @@
-"""One frame, every metric of the chosen protocols, in one pass."""
+"""Scores: one frame in one pass, many frames on several threads, means over captures."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+import math
+import os
+from collections import deque
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 
-from hwp_bench.base.errors import BadImage, BadInput, BadPrediction, ShapeMismatch
+from hwp_bench.base.errors import (
+    BadImage,
+    BadInput,
+    BadPrediction,
+    BadResult,
+    EmptyMask,
+    HwpError,
+    ShapeMismatch,
+)
 from hwp_bench.base.images import as_uint8
-from hwp_bench.metrics.oriented_distance import oriented_distance
 from hwp_bench.metrics.pixels import (
     Box,
     bounding_box,
@@ -17,11 +28,15 @@ from hwp_bench.metrics.pixels import (
     check_truth,
     composite,
     crop,
+    decibels,
     hand_pixels,
+    oriented_distance,
     scored_pixels,
+    squared_error,
+    ssim_box,
+    ssim_map,
 )
-from hwp_bench.metrics.protocol import HWP_V1, PAPER_WILDGHAND, PROTOCOLS, Protocol
-from hwp_bench.metrics.psnr_ssim import decibels, squared_error, ssim_box, ssim_map
+from hwp_bench.metrics.protocol import HWP_V1, PAPER_WILDGHAND, PROTOCOLS, Protocol, penalty
 
 #: A distance of two (H, W, 3) float images in [0, 1]; `hwp_bench.metrics.lpips.Lpips` is one.
 Network = Callable[[np.ndarray, np.ndarray], float]
@@ -190,3 +205,259 @@ def _lpips(
     box = box.at_least(protocol.smallest_lpips_box)
     inside = crop(region, box)
     return network(_on_black(pair.prediction, box, inside), _on_black(pair.target, box, inside))
+
+
+#: Frames per worker that are read ahead; bounds the memory of a long list of frames.
+READ_AHEAD = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One frame to score."""
+
+    #: (H, W, 3) uint8, or the error that says why it is missing.
+    prediction: np.ndarray | HwpError
+    #: (H, W, 3) uint8.
+    target: np.ndarray
+    #: (H, W) uint8 or bool, the data set's own visible-hand mask.
+    mask: np.ndarray
+    #: True where the mask holds the hand's share of each pixel.
+    coverage: bool = False
+
+
+@dataclass(frozen=True)
+class FrameScore:
+    """The scores of one frame."""
+
+    #: Metric name -> score; the declared penalties where the prediction failed; empty where
+    #: the data set shows no hand to score.
+    values: dict[str, float]
+    #: Why the prediction failed; None where it did not.
+    failure: str | None = None
+
+    @property
+    def empty(self) -> bool:
+        """True where the mask leaves no pixel to score; this does not depend on the prediction."""
+        return not self.values
+
+
+def score_frames(
+    frames: Iterable[Frame | Callable[[], Frame]],
+    protocols: Iterable[Protocol] = PROTOCOLS,
+    *,
+    networks: Mapping[str, Network] | None = None,
+    workers: int | None = None,
+) -> Iterator[FrameScore]:
+    """Score frames in parallel and yield the results in the order of the frames.
+
+    Args:
+        frames: the frames, or functions that read one each (they run on the workers, so
+            reading files is parallel too).
+        protocols: which protocols to score in.
+        networks: LPIPS by backbone name; see `score_frame`.
+        workers: number of threads; None takes one per core.
+
+    Yields:
+        one `FrameScore` per frame; the scores do not depend on `workers`.
+
+    Raises:
+        HwpError: the data set's own side of a frame is at fault (target or mask), or a reading
+            function raised; a fault of the prediction is a `FrameScore.failure` instead.
+    """
+    chosen = tuple(protocols)
+    available = dict(networks or {})
+
+    def work(item: Frame | Callable[[], Frame]) -> FrameScore:
+        return _score(item if isinstance(item, Frame) else item(), chosen, available)
+
+    _keep_freed_memory()
+    count = workers or os.cpu_count() or 1
+    if count == 1:
+        yield from map(work, frames)
+        return
+    pool = ThreadPoolExecutor(count, thread_name_prefix="score")
+    pending: deque[Future[FrameScore]] = deque()
+    try:
+        for item in frames:
+            pending.append(pool.submit(work, item))
+            if len(pending) > READ_AHEAD * count:
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _keep_freed_memory() -> None:
+    """Let the C library keep freed arrays of a frame's size for the next frame.
+
+    glibc hands blocks back to the kernel that are larger than the largest it has seen freed,
+    up to 32 MiB; getting them again, page by page, takes longer than the arithmetic does, and
+    threads wait for each other meanwhile. The block here is never touched, so it costs nothing.
+    """
+    np.empty(31 * 2**20, np.uint8)
+
+
+def _score(
+    frame: Frame, protocols: tuple[Protocol, ...], networks: Mapping[str, Network]
+) -> FrameScore:
+    check_truth(frame.target, frame.mask)
+    prediction = frame.prediction
+    failure: HwpError | None = None
+    if isinstance(prediction, HwpError):
+        # The mask is still checked first: a frame without a hand is not a failure of the method.
+        failure, prediction = prediction, frame.target
+    else:
+        try:
+            check_prediction(prediction, frame.target)
+        except HwpError as error:
+            failure, prediction = error, frame.target
+    try:
+        values = score_frame(
+            prediction,
+            frame.target,
+            frame.mask,
+            protocols,
+            coverage=frame.coverage,
+            networks={} if failure else networks,
+        )
+    except EmptyMask:
+        return FrameScore({})
+    if failure is not None:
+        return FrameScore(penalty(protocols, networks), str(failure))
+    return FrameScore(values)
+
+
+Scores = dict[str, float]
+
+
+@dataclass(frozen=True)
+class CaptureScores:
+    """The frame scores of one capture."""
+
+    #: Name of the capture, unique in one aggregation.
+    id: str
+    #: "right", "left" or "both".
+    hands: str
+    #: Perturbations of the capture; may be empty.
+    perturbations: tuple[str, ...]
+    #: Frame -> metric -> score: every scored frame, the penalties of failed ones included.
+    frames: Mapping[Hashable, Mapping[str, float]]
+
+    @property
+    def interacting(self) -> bool:
+        """True where two hands are shown."""
+        return self.hands == "both"
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Means over one set of captures, metric -> score each."""
+
+    #: Mean over the frames of each capture, by capture.
+    captures: dict[str, Scores]
+    #: Mean over the captures with it, by perturbation.
+    perturbations: dict[str, Scores]
+    #: Mean over the perturbations: each perturbation counts the same. Empty where no capture
+    #: has one.
+    macro: Scores
+    #: Mean over the captures: each capture counts the same.
+    capture_mean: Scores
+    #: Mean over all frames: each frame counts the same.
+    micro: Scores
+
+
+@dataclass(frozen=True)
+class Aggregate:
+    """The summaries that tables are made of."""
+
+    #: Over all captures.
+    overall: Summary
+    #: Over the captures of one hand; None if there are none.
+    single: Summary | None = None
+    #: Over the captures of two hands; None if there are none.
+    interacting: Summary | None = None
+
+
+def aggregate(captures: Iterable[CaptureScores]) -> Aggregate:
+    """Average frame scores; nothing is dropped, and NaN and infinity are refused.
+
+    Args:
+        captures: the scored captures; each lists every frame that was scored.
+
+    Returns:
+        the summaries of all captures, of the single hands, and of the interacting hands.
+
+    Raises:
+        BadResult: no capture; a capture twice or without frames; a score that is NaN or
+            infinite; frames that do not all have the same metrics.
+    """
+    listed = list(captures)
+    _check(listed)
+    single = [capture for capture in listed if not capture.interacting]
+    interacting = [capture for capture in listed if capture.interacting]
+    return Aggregate(
+        overall=_summarize(listed),
+        single=_summarize(single) if single else None,
+        interacting=_summarize(interacting) if interacting else None,
+    )
+
+
+def mean_scores(rows: Iterable[Mapping[str, float]]) -> Scores:
+    """Mean of each metric over `rows`, which all have the same metrics; {} for no rows."""
+    listed = list(rows)
+    if not listed:
+        return {}
+    return {
+        name: math.fsum(row[name] for row in listed) / len(listed) for name in sorted(listed[0])
+    }
+
+
+def _summarize(captures: Sequence[CaptureScores]) -> Summary:
+    by_id = sorted(captures, key=lambda capture: capture.id)
+    means = {capture.id: mean_scores(capture.frames.values()) for capture in by_id}
+    names = sorted({name for capture in by_id for name in capture.perturbations})
+    perturbations = {
+        name: mean_scores(means[c.id] for c in by_id if name in c.perturbations) for name in names
+    }
+    frames = [row for capture in by_id for row in capture.frames.values()]
+    return Summary(
+        captures=means,
+        perturbations=perturbations,
+        macro=mean_scores(perturbations.values()),
+        capture_mean=mean_scores(means.values()),
+        micro=mean_scores(frames),
+    )
+
+
+def _check(captures: Sequence[CaptureScores]) -> None:
+    if not captures:
+        raise BadResult("there are no captures to average", field="captures")
+    seen: set[str] = set()
+    metrics: frozenset[str] | None = None
+    for capture in captures:
+        if capture.id in seen:
+            raise BadResult("is listed twice", where=capture.id, field="id")
+        seen.add(capture.id)
+        if not capture.frames:
+            raise BadResult(
+                "has no scored frame",
+                where=capture.id,
+                field="frames",
+                remedy="Every capture of a result must have at least one frame with a hand.",
+            )
+        for frame, row in capture.frames.items():
+            names = frozenset(row)
+            metrics = names if metrics is None else metrics
+            if names != metrics or not names:
+                odd = ", ".join(sorted(names ^ metrics)) or "none at all"
+                raise BadResult(
+                    f"its metrics differ from the other frames' ({odd})",
+                    where=capture.id,
+                    field=f"frames[{frame}]",
+                )
+            for name, score in row.items():
+                if not math.isfinite(score):
+                    raise BadResult(
+                        f"the score is {score}", where=capture.id, field=f"frames[{frame}].{name}"
+                    )

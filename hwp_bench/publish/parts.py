@@ -12,7 +12,7 @@ from pathlib import Path
 
 from hwp_bench.base.errors import BadCapture, UsageError
 from hwp_bench.base.files import atomic_folder, write_json
-from hwp_bench.base.version import __version__
+from hwp_bench.base.packages import __version__
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.schema import (
     CAMERAS,

@@ -8,7 +8,7 @@ from dataclasses import replace
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.tables import Cell, Column, Table
 from hwp_bench.metrics import HWP_V1, METRICS, Protocol, metric
-from hwp_bench.metrics.aggregate import Aggregate, Scores, Summary, aggregate
+from hwp_bench.metrics.score import Aggregate, Scores, Summary, aggregate
 from hwp_bench.results import CaptureResult, Results
 from hwp_bench.results.bounds import per_second
 from hwp_bench.results.schema import differing_makers, differing_settings, score_rows

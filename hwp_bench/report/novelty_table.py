@@ -7,15 +7,14 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from hwp_bench.analysis.novelty import Novelty, measure_novelty
+from hwp_bench.base.console import track
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.images import read_rgb
-from hwp_bench.base.progress import track
 from hwp_bench.base.tables import Cell, Column, Table
 from hwp_bench.capture import Capture
 from hwp_bench.capture.splits import Split, split_for
-from hwp_bench.metrics.pixels import scored_pixels
+from hwp_bench.metrics.pixels import decibels, scored_pixels, squared_error
 from hwp_bench.metrics.protocol import HWP_V1
-from hwp_bench.metrics.psnr_ssim import decibels, squared_error
 from hwp_bench.report.evaluation_tables import labels
 from hwp_bench.report.sources import ResultsSource, stored_predictions
 from hwp_bench.results import CaptureResult

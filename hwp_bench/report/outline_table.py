@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from statistics import fmean
 
 from hwp_bench.analysis.outline import OutlineScores, outline_scores
+from hwp_bench.base.console import track
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.images import read_rgb
-from hwp_bench.base.progress import track
 from hwp_bench.base.tables import Cell, Column, Table
 from hwp_bench.capture import Capture
 from hwp_bench.report.evaluation_tables import labels

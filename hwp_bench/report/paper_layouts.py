@@ -9,7 +9,7 @@ from hwp_bench.analysis.statistics.pairing import MethodRuns
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.tables import Cell, Column, Table, without_empty_columns
 from hwp_bench.metrics import metric as metric_facts
-from hwp_bench.metrics.aggregate import Scores, Summary, aggregate, mean_scores
+from hwp_bench.metrics.score import Scores, Summary, aggregate, mean_scores
 from hwp_bench.results.published import MARK, NOTE, Measurement, PublishedTable, read_published
 from hwp_bench.results.schema import score_rows
 from hwp_bench.taxonomy import PERTURBATIONS, catalogue, perturbation

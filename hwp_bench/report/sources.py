@@ -12,9 +12,9 @@ import numpy as np
 from msgspec import Meta
 
 from hwp_bench.analysis.statistics.pairing import same_but_seed
+from hwp_bench.base.console import notice
 from hwp_bench.base.errors import BadResult, HwpError
 from hwp_bench.base.files import cache_root, inside, read_json, sha256_json
-from hwp_bench.base.progress import notice
 from hwp_bench.base.records import parse_record
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.reader import digest_at

@@ -13,7 +13,7 @@ from hwp_bench.base.errors import UsageError
 from hwp_bench.base.tables import Cell, Column, Table
 from hwp_bench.capture.schema import CaptureInfo
 from hwp_bench.metrics import metric as metric_facts
-from hwp_bench.metrics.aggregate import aggregate
+from hwp_bench.metrics.score import aggregate
 from hwp_bench.report.evaluation_tables import HEADLINE, labels, score_column
 from hwp_bench.report.sources import ResultsSource, mean_severity, mean_temporal_weight
 from hwp_bench.results.schema import score_rows

@@ -14,7 +14,7 @@ from msgspec import Meta
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import canonical_json
 from hwp_bench.base.records import Count, Line, Message, Seconds, Seed
-from hwp_bench.metrics.aggregate import CaptureScores, Scores, aggregate
+from hwp_bench.metrics.score import CaptureScores, Scores, aggregate
 from hwp_bench.results.bounds import (
     MAX_CAPTURES,
     MAX_CURVE,
@@ -227,7 +227,7 @@ class Results:
 
 
 def score_rows(results: Results) -> list[CaptureScores]:
-    """Return the captures as `hwp_bench.metrics.aggregate` takes them."""
+    """Return the captures as `hwp_bench.metrics.score` takes them."""
     return [
         CaptureScores(
             id=capture.id,

@@ -8,10 +8,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from hwp_bench.base.arguments import place as checked_place
+from hwp_bench.base.console import notice
 from hwp_bench.base.errors import BadResult
+from hwp_bench.base.errors import place as checked_place
 from hwp_bench.base.files import inside, read_json, sha256_json, write_json
-from hwp_bench.base.progress import notice
 from hwp_bench.base.records import parse_record, without_schema
 from hwp_bench.results.bounds import MAX_BYTES
 from hwp_bench.results.schema import Results

@@ -12,12 +12,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from hwp_bench.base.errors import BadInput, BadMethod, MethodFailed
+from hwp_bench.base.console import notice
+from hwp_bench.base.errors import BadInput, BadMethod, MethodFailed, one_line, shown
 from hwp_bench.base.files import inside, read_json, write_json
-from hwp_bench.base.progress import notice
-from hwp_bench.base.scratch import scratch_folder
-from hwp_bench.base.text import one_line, shown
-from hwp_bench.base.trees import remove_tree
+from hwp_bench.base.folders import remove_tree, scratch_folder
 from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.manifest import MethodManifest
 from hwp_bench.results.walls import WALLED

@@ -9,8 +9,7 @@ from __future__ import annotations
 import importlib
 import sys
 
-from hwp_bench.base.denormals import flushed_process
-from hwp_bench.base.threads import share_processors
+from hwp_bench.base.numerics import flushed_process, share_processors
 
 
 def main() -> int:

@@ -18,14 +18,13 @@ from pathlib import Path
 
 import numpy as np
 
-from hwp_bench.base.errors import BadMethod, HwpError, MethodFailed
-from hwp_bench.base.evenly import evenly
+from hwp_bench.base.arrays import evenly
+from hwp_bench.base.console import notice
+from hwp_bench.base.errors import BadMethod, HwpError, MethodFailed, shown
 from hwp_bench.base.files import read_json, write_json
 from hwp_bench.base.images import write_image
-from hwp_bench.base.progress import notice
-from hwp_bench.base.text import shown
 from hwp_bench.capture.schema import frame_name
-from hwp_bench.hands.parameters import Camera, HandPose
+from hwp_bench.hands.skeleton import Camera, HandPose
 from hwp_bench.methods.contract import Avatar, Budget, MethodFactory, TrainingCapture
 from hwp_bench.methods.request import open_request
 from hwp_bench.run.output import (

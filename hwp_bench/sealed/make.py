@@ -8,8 +8,8 @@ from pathlib import Path
 
 from hwp_bench.base.errors import BadInput
 from hwp_bench.base.files import refuse_existing
-from hwp_bench.base.locks import exclusive
-from hwp_bench.base.version import __version__
+from hwp_bench.base.folders import exclusive
+from hwp_bench.base.packages import __version__
 from hwp_bench.publish import publish
 from hwp_bench.publish.parts import PUBLIC, SEALED
 from hwp_bench.run.engine import Engine, Needs

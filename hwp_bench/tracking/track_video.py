@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from hwp_bench.base.console import progress
 from hwp_bench.base.errors import HwpError, UsageError
-from hwp_bench.base.progress import progress
 from hwp_bench.importers.shared.hand_tracks import HandTracks, write_hand_tracks
 from hwp_bench.importers.video.decode import (
     Reading,

@@ -25,7 +25,7 @@ from exposure_fit.method import ExposureMethod
 from exposure_fit.motion import motion_px, nearest_turn, pose_velocities, velocities
 from exposure_fit.recipe import ExposureRecipe
 from hwp_bench.capture import Capture
-from hwp_bench.hands.parameters import HandParameters
+from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.methods.contract import Budget, TrainingCapture
 from plain_fit.method import PlainMethod
 from wildghand.gaussians.training import load_frames

@@ -23,7 +23,7 @@ from painted import (
 )
 
 from hwp_bench.hands import pose_hand
-from hwp_bench.hands.parameters import HandParameters
+from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.methods.contract import Budget
 from hwp_bench.sim.geometry.raycast import Tracer
 from plain_fit.method import PlainMethod

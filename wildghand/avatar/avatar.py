@@ -1,8 +1,10 @@
-"""A fitted avatar: drawing it in any pose."""
+"""A fitted avatar: drawing it in any pose, also inside a notebook."""
 
 from __future__ import annotations
 
+import base64
 import functools
+import io
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -12,20 +14,121 @@ import numpy as np
 import torch
 from msgspec import Meta
 
-from hwp_bench.base.errors import BadInput
+from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.files import write_json
-from hwp_bench.base.images import write_image
+from hwp_bench.base.images import as_uint8, write_image
 from hwp_bench.base.records import Count, Seconds
 from hwp_bench.capture.schema import MAX_FRAMES, HandModelId
 from hwp_bench.hands import load_template
 from hwp_bench.methods.contract import Camera, HandPose
-from wildghand.avatar import inline
-from wildghand.avatar.hand_angles import REST
-from wildghand.avatar.studio import Pose, Studio
+from wildghand.avatar.studio import REST, Pose, Studio
 from wildghand.gaussians.hand_avatar import HandAvatar, PosedHands
 from wildghand.model.model import WildGHandModel
 from wildghand.model.settings import WildGHandSettings
 from wildghand.splat.threads import denormals_flushed
+
+#: Frames of a turn, and milliseconds of each.
+TURN_FRAMES, TURN_MS = 24, 100
+#: Largest edge of an inline picture, px: it lies in the notebook's file.
+MAX_EDGE = 2048
+# Of WebP; a hand of 320 px turns in some 100 kB.
+_QUALITY = 80
+
+
+@dataclass(frozen=True)
+class InlinePicture:
+    """A picture that notebooks show where it is the value of a cell."""
+
+    #: The encoded picture.
+    data: bytes
+    #: Its media type: `image/png` or `image/webp`.
+    media: str
+    #: Edge in the page, px.
+    size: int
+    #: Said in place of the picture where there are no pictures.
+    text: str
+    #: A page to show instead, whole HTML; None: there is no such page.
+    page: str | None = None
+
+    def __repr__(self) -> str:
+        return f"InlinePicture({self.text})"
+
+    def _repr_html_(self) -> str:
+        """Return the picture as HTML that needs no other file."""
+        if self.page is not None:
+            source = _data_uri(self.page.encode(), "text/html")
+            place = 'style="width:100%;height:540px;border:0"'
+            return f'<iframe src="{source}" title="{self.text}" {place}></iframe>'
+        source = _data_uri(self.data, self.media)
+        return f'<img src="{source}" width="{self.size}" height="{self.size}" alt="{self.text}">'
+
+    def _repr_mimebundle_(self, **_: Any) -> dict[str, Any]:
+        """Return what a notebook stores: the picture where it knows its type, HTML, and text."""
+        bundle: dict[str, Any] = {"text/html": self._repr_html_(), "text/plain": repr(self)}
+        if self.media == "image/png" and self.page is None:
+            # Notebooks store pictures as base64, and pages such as GitHub's show them.
+            bundle["image/png"] = base64.b64encode(self.data).decode()
+            del bundle["text/html"]
+        return bundle
+
+
+def still(rgba: np.ndarray, background: tuple[int, int, int], text: str) -> InlinePicture:
+    """Return one drawing over a colour.
+
+    Args:
+        rgba: (H, W, 4) float as `Avatar.render` gives it.
+    """
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    Image.fromarray(over(rgba, background)).save(buffer, format="PNG")
+    return InlinePicture(buffer.getvalue(), "image/png", rgba.shape[1], text)
+
+
+def turntable(
+    draw: Callable[[float], np.ndarray], background: tuple[int, int, int], text: str
+) -> InlinePicture:
+    """Return a turn as an animated WebP image.
+
+    Args:
+        draw: takes degrees about the vertical, gives (H, W, 4) float as `Avatar.render` does.
+    """
+    from PIL import Image
+
+    turns = [360.0 * frame / TURN_FRAMES for frame in range(TURN_FRAMES)]
+    frames = [Image.fromarray(over(draw(turn), background)) for turn in turns]
+    buffer = io.BytesIO()
+    frames[0].save(
+        buffer,
+        format="WEBP",
+        save_all=True,
+        append_images=frames[1:],
+        duration=TURN_MS,
+        loop=0,
+        quality=_QUALITY,
+    )
+    return InlinePicture(buffer.getvalue(), "image/webp", frames[0].width, text)
+
+
+def over(rgba: np.ndarray, background: tuple[int, int, int]) -> np.ndarray:
+    """Return a drawing over a colour: (H, W, 3) uint8.
+
+    Args:
+        rgba: (H, W, 4) float in [0, 1], premultiplied.
+    """
+    behind = (1.0 - rgba[..., 3:]) * (np.array(background, dtype=np.float32) / 255.0)
+    return as_uint8(rgba[..., :3] + behind)
+
+
+def check_edge(size: int) -> None:
+    """Check the edge of an inline picture."""
+    if not 16 <= size <= MAX_EDGE:
+        raise UsageError(f"is {size}", field="size", remedy=f"Use 16 to {MAX_EDGE} px.")
+
+
+def _data_uri(data: bytes, media: str) -> str:
+    return f"data:{media};base64,{base64.b64encode(data).decode()}"
+
 
 _Frame = Annotated[int, Meta(ge=0, lt=MAX_FRAMES)]
 # A little more than what is possible, since numbers are rounded.
@@ -83,11 +186,7 @@ class PosedGaussians:
         return f"PosedGaussians({len(self)} Gaussians)"
 
     def require_finite(self) -> None:
-        """Refuse Gaussians with a number that is NaN or infinite, before they are written.
-
-        Raises:
-            BadInput: there is one; the field is named.
-        """
+        """Refuse Gaussians with a number that is NaN or infinite, before they are written."""
         for item in fields(self):
             bad = int((~np.isfinite(getattr(self, item.name))).sum())
             if bad:
@@ -185,7 +284,7 @@ class WildGHandAvatar(HandAvatar):
             UsageError: no hand, one that was not fitted, or a pose that is none.
         """
         if camera is None:
-            inline.check_edge(size)
+            check_edge(size)
             camera = self.studio.camera(size, size)
         return super().render(self._hands(hands), camera)
 
@@ -195,26 +294,23 @@ class WildGHandAvatar(HandAvatar):
         *,
         size: int = 320,
         background: tuple[int, int, int] = (255, 255, 255),
-        interactive: bool = False,
-    ) -> inline.InlinePicture:
+    ) -> InlinePicture:
         """Show the avatar in a notebook: in a pose, or from all around.
+
+        `wildghand.page.show_page` shows a page on which it is turned and posed.
 
         Args:
             pose: as `render` takes it; None: a turn at rest.
             size: edge, px.
             background: sRGB, 0 to 255.
-            interactive: without a pose, the page of `wildghand.page`, which is turned and posed.
-                It adds some megabytes to the notebook, and takes some seconds to write.
 
         Raises:
             UsageError: a pose that is none, or a size out of range.
         """
-        inline.check_edge(size)
-        page = inline.page_of(self) if interactive and pose is None else None
-        if pose is not None or page is not None:
-            drawn = self.render(REST if pose is None else pose, size=size)
-            return inline.still(drawn, background, repr(self), page)
-        return inline.turntable(
+        check_edge(size)
+        if pose is not None:
+            return still(self.render(pose, size=size), background, repr(self))
+        return turntable(
             lambda turn: self.render(self.studio.posed(REST, turn), size=size),
             background,
             repr(self),
@@ -236,11 +332,7 @@ class WildGHandAvatar(HandAvatar):
         return self.pose(self.rest_poses())
 
     def posed(self, hands: Mapping[str, HandPose]) -> PosedHands:
-        """Return the hands as tensors; one in a pose of the clip in that which the fit believes.
-
-        Raises:
-            UsageError: no hand, or one that was not fitted.
-        """
+        """Return the hands as tensors; one in a pose of the clip in that which the fit believes."""
         return super().posed(self.believed(hands))
 
     def believed(self, hands: Mapping[str, HandPose]) -> dict[str, HandPose]:

@@ -4,6 +4,8 @@ avatar.json           what it is, of which hand model, how it was fitted
 model.safetensors     every tensor of the model
 weights/000012.png    weight mask of a training frame, to look at
 call.json             digest of the call that made it, where one call made it of a capture
+
+Tensors are compared with the description before memory is taken.
 """
 
 from __future__ import annotations
@@ -11,6 +13,8 @@ from __future__ import annotations
 import dataclasses
 import functools
 import os
+import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,22 +22,138 @@ import numpy as np
 import torch
 from msgspec import Meta
 
-from hwp_bench.base.arguments import place
-from hwp_bench.base.errors import BadInput, HwpError
+from hwp_bench.base.errors import BadInput, HwpError, place, shown
 from hwp_bench.base.files import atomic_folder, read_json, write_json
+from hwp_bench.base.images import read_gray, write_image
 from hwp_bench.base.records import Seed, parse_record
 from hwp_bench.capture.schema import SIDES, HandModelId
 from hwp_bench.hands import HandTemplate, load_template
 from wildghand.avatar.avatar import FitRecord, WildGHandAvatar
-from wildghand.avatar.tensors import MAX_TENSORS, read_tensors
-from wildghand.avatar.weight_masks import read_weight_masks, write_weight_masks
 from wildghand.evidence import ColorChanges, Evidence, rename_former
 from wildghand.light import KnownLight
 from wildghand.model.assemble import make_model
-from wildghand.model.settings import read_stored, read_version_1
+from wildghand.model.settings import WildGHandSettings, read_stored, read_version_1
+from wildghand.network.network import MAPS, shapes_of_settings
 from wildghand.poses import ClipPoses
 from wildghand.shadows import CastLight
 from wildghand.subject import SubjectShape
+
+#: Largest model that is read, bytes.
+MAX_MODEL_BYTES = 4 << 30
+#: Most tensors of a model.
+MAX_TENSORS = 10_000
+
+#: Largest number of a tensor that is read; those of fits lie far below.
+LARGEST = 1e6
+
+_ANOTHER_COPY = "The avatar is damaged: take another copy, or fit it again."
+_FLOATS = ("F16", "BF16", "F32", "F64")
+
+
+def read_tensors(
+    file: Path,
+    settings: WildGHandSettings,
+    sides: Sequence[str],
+    frame_count: int,
+    declared: Sequence[str] | None = None,
+) -> dict[str, torch.Tensor]:
+    """Read the tensors of an avatar.
+
+    Args:
+        declared: names of all tensors; None: the description does not say.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    if not file.is_file() or file.stat().st_size > MAX_MODEL_BYTES:
+        raise BadInput(f"is missing or larger than {MAX_MODEL_BYTES} bytes", where=file)
+    try:
+        expected = _shapes(settings, sides, frame_count)
+        with safe_open(file, "pt") as stored:
+            names = list(stored.keys())
+            if len(names) > MAX_TENSORS:
+                raise BadInput(f"holds more than {MAX_TENSORS:,} tensors", where=file)
+            for name in names:
+                part = stored.get_slice(name)
+                _check_part(name, part.get_shape(), str(part.get_dtype()), expected, file)
+            for name in sorted((expected.keys() | set(declared or ())) - set(names)):
+                raise BadInput(
+                    "is missing", where=file, field=shown(name)[:100], remedy=_ANOTHER_COPY
+                )
+            for name in sorted(set(names) - set(names if declared is None else declared)):
+                raise BadInput(
+                    "is not among the tensors that its description names",
+                    where=file,
+                    field=shown(name)[:100],
+                    remedy=_ANOTHER_COPY,
+                )
+            tensors = {name: stored.get_tensor(name) for name in names}
+    except (SafetensorError, RuntimeError, OSError, ValueError, AssertionError) as error:
+        problem = (str(error).splitlines() or [type(error).__name__])[0][:300]
+        raise BadInput(f"does not hold this avatar's tensors ({problem})", where=file) from error
+    for name, tensor in tensors.items():
+        if not bool(torch.isfinite(tensor).all()):
+            raise BadInput("holds NaN or infinity", where=file, field=shown(name)[:100])
+        if tensor.numel() and float(tensor.abs().max()) > LARGEST:
+            raise BadInput(
+                f"holds a number beyond {LARGEST:g}",
+                where=file,
+                field=shown(name)[:100],
+                remedy=_ANOTHER_COPY,
+            )
+    return tensors
+
+
+def _check_part(
+    name: str, shape: Sequence[int], kind: str, expected: dict[str, tuple[int, ...]], file: Path
+) -> None:
+    field = shown(name)[:100]
+    if kind not in _FLOATS:
+        raise BadInput(f"holds {kind}, not floating point", where=file, field=field)
+    if name in expected and tuple(shape) != expected[name]:
+        raise BadInput(
+            f"is {tuple(shape)}, not {expected[name]} as its description says"[:200],
+            where=file,
+            field=field,
+        )
+
+
+def _shapes(
+    settings: WildGHandSettings, sides: Sequence[str], frame_count: int
+) -> dict[str, tuple[int, ...]]:
+    """Shapes of the tensors whose size the description states, without memory for any."""
+    shapes = {
+        "log_gains": (frame_count, 3),
+        "pose_steps": (len(sides), frame_count, 16, 3),
+        "transl_steps": (len(sides), frame_count, 3),
+    }
+    absent = {f"{MAPS}{side}" for side in ("right", "left") if side not in sides}
+    for name, shape in shapes_of_settings(settings.network).items():
+        if name not in absent:
+            shapes[f"network.{name}"] = tuple(shape)
+    return shapes
+
+
+# More than any fit writes.
+_MOST = 1000
+
+
+def write_weight_masks(avatar: WildGHandAvatar, folder: Path) -> None:
+    """Write the weight masks that the avatar knows as images, named by frame."""
+    for frame, mask in sorted(avatar.weight_masks.items()):
+        write_image(folder / f"{frame:06d}.png", mask)
+
+
+def read_weight_masks(folder: Path, frames: list[int]) -> dict[int, np.ndarray]:
+    """Read the weight masks of frames that an avatar was fitted to.
+
+    Returns:
+        (H, W) uint8 by frame.
+    """
+    named = {frame: folder / f"{frame:06d}.png" for frame in frames}
+    found = sorted(path.name for path in folder.glob("*.png")) if folder.is_dir() else []
+    there = {int(name[:6]) for name in found[:_MOST] if re.fullmatch(r"\d{6}\.png", name)}
+    return {frame: read_gray(path) for frame, path in named.items() if frame in there}
+
 
 #: Version of the folder.
 SCHEMA = "wildghand-avatar/2"
@@ -165,19 +285,20 @@ def load_avatar(
     file = root / MODEL
     tensors = rename_former(read_tensors(file, settings, value.sides, frame_count, value.tensors))
     try:
-        subject = SubjectShape.from_tensors(tensors, next(iter(templates.values())), str(file))
+        vertices = len(next(iter(templates.values())).vertices)
+        subject = SubjectShape.from_tensors(tensors, str(file), V=vertices)
         model = make_model(
             templates, settings, mean_color, frame_count, value.seed, device, subject
         )
         light = KnownLight.from_tensors(tensors, str(file))
         cast = CastLight.from_tensors(tensors, str(file))
-        poses = ClipPoses.from_tensors(tensors, tuple(value.sides), str(file))
+        poses = ClipPoses.from_tensors(tensors, str(file))
         for found in (light, cast, poses):
             if found is not None:
                 model.keep(found)
         counts = {side: len(rig) for side, rig in model.rigs.items()}
-        evidence = Evidence.from_tensors(tensors, counts, str(file))
-        colors = ColorChanges.from_tensors(tensors, counts, str(file))
+        evidence = Evidence.from_tensors(tensors, str(file), N=counts)
+        colors = ColorChanges.from_tensors(tensors, str(file), N=counts)
         for kept in (evidence, colors):
             if kept is not None:
                 model.keep(kept)

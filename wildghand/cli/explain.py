@@ -34,8 +34,8 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.base.files import check_places
     from hwp_bench.base.images import write_image
     from hwp_bench.capture import open_capture
-    from wildghand.avatar.explain import explain_frames, explanation_sheet
     from wildghand.avatar.files import load_avatar
+    from wildghand.avatar.render import explain_frames, explanation_sheet
 
     check_places({"--out": args.out}, {"AVATAR": args.avatar, "CAPTURE": args.capture})
     capture = open_capture(args.capture)

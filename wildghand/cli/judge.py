@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
 def _judge(capture: Capture) -> tuple[FrameAssessment, dict[str, np.ndarray]]:
     import numpy as np
 
-    from hwp_bench.base.progress import track
+    from hwp_bench.base.console import track
     from wildghand.prepass import capture_input, estimated_severity, judge_frames
 
     every = np.arange(len(capture))

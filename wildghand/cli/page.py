@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.base.files import check_places
     from hwp_bench.capture import open_capture
     from wildghand.page import write_page
-    from wildghand.viewer.motion import capture_of
+    from wildghand.viewer.posed_view import capture_of
 
     check_places({"--out": args.out}, {"AVATAR": args.avatar, "--poses": args.poses})
     place = args.poses or capture_of(args.avatar)

@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.base.files import check_places
     from hwp_bench.capture import open_capture
     from wildghand.avatar.files import load_avatar
-    from wildghand.avatar.playback import render_clip
+    from wildghand.avatar.render import render_clip
 
     if not 0 <= args.background <= 255:
         raise UsageError(f"is {args.background}", field="--background", remedy="Use 0 to 255.")

@@ -42,7 +42,7 @@ def watching(args: argparse.Namespace, *, shown: bool) -> Iterator[Watch | None]
     if not shown:
         yield None
         return
-    from hwp_bench.base.progress import notice
+    from hwp_bench.base.console import notice
     from wildghand.viewer.live import serve_fit
 
     with serve_fit(address_of(args)) as served:

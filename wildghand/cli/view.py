@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
 
     from hwp_bench.capture import open_capture
     from wildghand.avatar.files import load_avatar
-    from wildghand.viewer.motion import Motion, capture_of
+    from wildghand.viewer.posed_view import Motion, capture_of
     from wildghand.viewer.server import require_viser
     from wildghand.viewer.view import ViewSettings, serve_view
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -17,22 +18,23 @@ from torch.nn.functional import normalize
 
 from wildghand.evidence.settings import EvidenceSettings
 from wildghand.gaussians.attributes import RawAttributes
-from wildghand.gaussians.kept_tensors import kept_tensor
+from wildghand.gaussians.found import Found, Kept, read_tensor
 
-_OFFSETS, _SHAPES, _WALLS = "evidence_offsets_", "evidence_shapes_", "evidence_wall_"
+_WALLS = "evidence_wall_"
 # The disc: standard deviations along the skin and across it, in spacings of the anchors, and its
 # opacity before the sigmoid.
 _WIDE, _THIN, _OPAQUE = 0.6, 0.2, 4.0
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class Evidence(Found):
     """The share of what a fit has found that is kept of each Gaussian, in [0, 1]."""
 
+    prefix = "evidence_"
     #: (N,) by side, of the offset.
-    offsets: Mapping[str, Tensor]
+    offsets: Annotated[Mapping[str, Tensor], Kept(("N",), 0.0, 1.0)]
     #: (N,) by side, of scales, orientation and transparency.
-    shapes: Mapping[str, Tensor]
+    shapes: Annotated[Mapping[str, Tensor], Kept(("N",), 0.0, 1.0)]
     #: Sides whose open wrist is drawn without the wall that closes it.
     open_wrists: frozenset[str] = frozenset()
 
@@ -84,52 +86,27 @@ class Evidence:
         """Keep all of all Gaussians."""
         return self.spare({side: torch.ones_like(share) > 0 for side, share in self.shapes.items()})
 
-    def equals(self, other: Evidence | None) -> bool:
-        """Whether another has the same shares."""
-        if other is None:
-            return False
-        mine, theirs = self.to_tensors(), other.to_tensors()
-        return all(torch.equal(shares, theirs[name]) for name, shares in mine.items())
-
     def to_tensors(self) -> dict[str, Tensor]:
-        """The shares by the names under which an avatar keeps them."""
-        return {
-            **{f"{_OFFSETS}{side}": shares for side, shares in self.offsets.items()},
-            **{f"{_SHAPES}{side}": shares for side, shares in self.shapes.items()},
-            **{
-                f"{_WALLS}{side}": shares.new_tensor([float(side not in self.open_wrists)])
-                for side, shares in self.shapes.items()
-            },
+        """The shares, and whether a wall closes each wrist (1,), as an avatar keeps them."""
+        walls = {
+            f"{_WALLS}{side}": shares.new_tensor([float(side not in self.open_wrists)])
+            for side, shares in self.shapes.items()
         }
+        return {**super().to_tensors(), **walls}
 
     @classmethod
     def from_tensors(
-        cls, tensors: Mapping[str, Tensor], counts: Mapping[str, int], where: str
+        cls, tensors: Mapping[str, Tensor], where: str, **sizes: int | Mapping[str, int]
     ) -> Evidence | None:
-        """Read what `to_tensors` made.
-
-        Args:
-            tensors: of an avatar.
-            counts: N by side.
-            where: the file, for messages.
-
-        Returns:
-            The evidence; None where the avatar keeps none.
-
-        Raises:
-            BadInput: a part is missing, of another shape, or no share.
-        """
-        if not any(f"{_OFFSETS}{side}" in tensors for side in counts):
+        """Read what `to_tensors` made; see `Found.from_tensors`."""
+        found = super().from_tensors(tensors, where, **sizes)
+        if found is None:
             return None
-        for side, count in counts.items():
-            for name in (f"{_OFFSETS}{side}", f"{_SHAPES}{side}"):
-                kept_tensor(tensors, name, (count,), (0, 1), where)
-            kept_tensor(tensors, f"{_WALLS}{side}", (1,), (0, 1), where)
-        return cls(
-            {side: tensors[f"{_OFFSETS}{side}"].float() for side in counts},
-            {side: tensors[f"{_SHAPES}{side}"].float() for side in counts},
-            frozenset(side for side in counts if not bool(tensors[f"{_WALLS}{side}"] > 0.5)),
-        )
+        walls = {
+            side: read_tensor(tensors, f"{_WALLS}{side}", (1,), (0.0, 1.0), where)
+            for side in found.shapes
+        }
+        return replace(found, open_wrists=frozenset(s for s, wall in walls.items() if wall <= 0.5))
 
 
 def weigh_evidence(shown: Mapping[str, Tensor], count: int, settings: EvidenceSettings) -> Evidence:

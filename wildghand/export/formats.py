@@ -9,25 +9,31 @@ import numpy as np
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import atomic_write
-from hwp_bench.base.version import __version__
+from hwp_bench.base.packages import __version__
 from hwp_bench.capture import Capture
 from hwp_bench.hands import load_template
 from wildghand.avatar.avatar import WildGHandAvatar
-from wildghand.avatar.playback import shown_sides
-from wildghand.export.all_round import MAX_DEGREE, harmonics, seen, standing
-from wildghand.export.motion import capture_motion, closing_motion
-from wildghand.export.placing import (
+from wildghand.avatar.render import shown_sides
+from wildghand.export.mesh import (
+    SkinnedHand,
+    capture_motion,
+    closing_motion,
+    require_skinning,
+    skinned_glb_bytes,
+)
+from wildghand.export.splat_files import ply_bytes, splat_glb_bytes, spz_bytes
+from wildghand.export.splats import (
     HALF_TURN,
+    MAX_DEGREE,
     SUPERSPLAT_SCALE,
     for_supersplat,
+    harmonics,
     laid_to_rest,
     require_scale,
     scaled,
+    seen,
+    standing,
 )
-from wildghand.export.ply import ply_bytes
-from wildghand.export.skinned_glb import SkinnedHand, require_skinning, skinned_glb_bytes
-from wildghand.export.splat_glb import splat_glb_bytes
-from wildghand.export.spz import spz_bytes
 from wildghand.export.texture import SIZE, baked
 
 #: Content by extension.
@@ -58,12 +64,7 @@ class ExportSettings:
 
 
 def check_target(path: Path, settings: ExportSettings, *, overwrite: bool) -> None:
-    """Refuse what cannot be written, before anything is read.
-
-    Raises:
-        UsageError: the extension is not known, does not go with the settings, or the file is
-            there and may not be replaced.
-    """
+    """Refuse what cannot be written, before anything is read."""
     suffix = path.suffix.lower()
     if suffix not in FORMATS:
         known = "; ".join(f"{name}: {text}" for name, text in FORMATS.items())

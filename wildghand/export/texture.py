@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from hwp_bench.base.nearest import kd_tree
-from hwp_bench.base.ray_mesh import ray_mesh
+from hwp_bench.base.numerics import kd_tree
+from hwp_bench.base.rays import ray_mesh
 from hwp_bench.hands import HandTemplate, pose_hand, vertex_normals
 from hwp_bench.methods.contract import Camera, HandPose
 from wildghand.avatar.avatar import WildGHandAvatar
-from wildghand.export.all_round import TURNS, middle, turned, view_turn
+from wildghand.export.splats import TURNS, middle, turned, view_turn
 
 #: Texels along an edge.
 SIZE = 1024
@@ -51,12 +51,6 @@ def baked(
     The hand turns in the studio as in the turntable. A picture counts where it shows the skin:
     facing the camera, nothing in front, covered by Gaussians. Skin that no picture shows takes the
     colour of the nearest skin that one shows; texels outside of the skin that of the nearest texel.
-
-    Args:
-        avatar: what is drawn.
-        side: which of its hands.
-        layout: its texture coordinates.
-        size: texels along an edge.
     """
     template = avatar.model.rigs[side].template
     faces = template.faces.cpu().numpy()
@@ -92,10 +86,6 @@ def baked(
 
 def skin_texels(layout: HandTemplate, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The texels whose middles lie on the skin.
-
-    Args:
-        layout: texture coordinates.
-        size: texels along an edge.
 
     Returns:
         (M,) their numbers, row by row from the top; (M,) faces; (M, 3) barycentric coordinates.

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hwp_bench.base.evenly import evenly
+from hwp_bench.base.arrays import evenly
 from wildghand.fitting.light_samples import CHUNK, light_samples
 from wildghand.gaussians.training import TrainingClip
 from wildghand.light import KnownLight, LightSettings, fit_light

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from hwp_bench.base.evenly import evenly
+from hwp_bench.base.arrays import evenly
 from wildghand.evidence import (
     ColorChanges,
     Evidence,

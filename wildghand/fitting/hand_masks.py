@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 import torch
 
-from hwp_bench.base.progress import track
+from hwp_bench.base.console import track
 from hwp_bench.hands import HandTemplate, pose_hand, project
 from hwp_bench.hands.raster import draw_faces
 from hwp_bench.methods.contract import TrainingCapture

@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from hwp_bench.base.progress import notice
+from hwp_bench.base.console import notice
 from hwp_bench.methods.contract import Budget, Report
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.fitting.averaging import AveragedAvatar

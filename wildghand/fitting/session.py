@@ -11,10 +11,10 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from hwp_bench.base.console import notice, progress
 from hwp_bench.base.errors import BadInput, HwpError, UsageError
 from hwp_bench.base.files import disc_errors, sha256_file, sha256_json
-from hwp_bench.base.locks import exclusive
-from hwp_bench.base.progress import notice, progress
+from hwp_bench.base.folders import exclusive
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.splits import Split, contiguous_split
 from hwp_bench.methods.contract import REQUEST, Avatar, Budget, RunSettings

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from hwp_bench.hands import HandTemplate
-from hwp_bench.hands.footprint import HandSurfaces
+from hwp_bench.hands.anchors import HandSurfaces
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.gaussians.training import TrainingFrames
 

@@ -7,8 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from hwp_bench.base.arguments import of_type, place, real_number, whole_number
-from hwp_bench.base.errors import UsageError
+from hwp_bench.base.errors import UsageError, of_type, place, real_number, whole_number
 from hwp_bench.capture import Capture
 from hwp_bench.methods.contract import Budget
 from wildghand.avatar.avatar import WildGHandAvatar

@@ -6,9 +6,9 @@ from dataclasses import asdict, replace
 
 import numpy as np
 
+from hwp_bench.base.console import notice
 from hwp_bench.base.errors import BadInput
 from hwp_bench.base.files import canonical_json, sha256_of
-from hwp_bench.base.progress import notice
 from hwp_bench.importers.shared.association import tracked_sides
 from hwp_bench.importers.shared.landmarks import read_landmarks
 from hwp_bench.importers.video import FrameRange, VideoImport, import_video

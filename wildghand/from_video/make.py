@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from hwp_bench.base.errors import BadInput, UsageError
-from hwp_bench.base.locks import exclusive
-from hwp_bench.base.movies import check_encoder
+from hwp_bench.base.folders import exclusive
+from hwp_bench.base.images import check_encoder
 from hwp_bench.capture import open_capture
 from hwp_bench.importers.video.decode import probe
 from wildghand.avatar.avatar import WildGHandAvatar

@@ -6,8 +6,7 @@ import os
 import time
 from collections.abc import Sequence
 
-from hwp_bench.base.progress import notice
-from hwp_bench.base.stages_view import StagesView
+from hwp_bench.base.console import StagesView, notice
 from wildghand.from_video.job import Job
 from wildghand.from_video.pace import Pace
 from wildghand.from_video.record import JobRecord, StageRecord, read_record, write_record

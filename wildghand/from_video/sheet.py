@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from hwp_bench.base.arrays import evenly
 from hwp_bench.base.drawing import fitted, labelled, sheet
-from hwp_bench.base.evenly import evenly
 from hwp_bench.base.images import as_uint8, read_gray, write_image
 from hwp_bench.capture import Capture, open_capture
 from wildghand.avatar.avatar import WildGHandAvatar

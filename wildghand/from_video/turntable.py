@@ -6,9 +6,8 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from hwp_bench.base.images import as_uint8
-from hwp_bench.base.movies import write_movie
-from hwp_bench.base.progress import track
+from hwp_bench.base.console import track
+from hwp_bench.base.images import as_uint8, write_movie
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import load_avatar
 from wildghand.from_video.fit import avatar_digest

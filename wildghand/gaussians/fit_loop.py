@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from hwp_bench.base.errors import DidNotConverge, MissingDependency
-from hwp_bench.base.threads import count_is_chosen
+from hwp_bench.base.numerics import count_is_chosen
 from hwp_bench.methods.contract import Budget, Report
 from wildghand.gaussians.adam import ClippedAdam
 from wildghand.gaussians.losses import LANES, photometric_loss

@@ -19,8 +19,8 @@ import numpy as np
 import torch
 from numba import types
 
-from hwp_bench.base.compiled import compiled
 from hwp_bench.base.errors import ShapeMismatch
+from hwp_bench.base.kernels import compiled
 from wildghand.splat.kernels.jit import inline, next_job
 from wildghand.splat.kernels.vectors import (
     Vector,

@@ -8,9 +8,9 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
+from hwp_bench.base.arrays import read_tensors
 from hwp_bench.base.colors import LUMA
 from hwp_bench.base.errors import BadInput, ShapeMismatch
-from hwp_bench.base.tensor_files import read_tensors
 
 #: Octaves of the filter bank.
 SCALES = 4

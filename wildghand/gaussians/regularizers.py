@@ -18,7 +18,7 @@ from torch import Tensor, relu, stack
 from torch.nn.functional import normalize
 
 from hwp_bench.base.errors import ShapeMismatch
-from hwp_bench.base.nearest import kd_tree
+from hwp_bench.base.numerics import kd_tree
 from hwp_bench.hands.anchors import anchor_frames, anchor_positions
 from wildghand.gaussians.attributes import Activation, RawAttributes
 from wildghand.gaussians.rig import HandRig

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hwp_bench.base.compiled import compiled, helper
+from hwp_bench.base.kernels import compiled, helper
 from hwp_bench.hands import HandTemplate, TemplateTensors, pose_hand
 from hwp_bench.hands.anchors import SurfaceAnchors, anchor_frames, anchor_positions, sample_surface
 from wildghand.gaussians.quaternions import matrix_to_quat

@@ -9,8 +9,8 @@ from typing import Protocol
 import numpy as np
 import torch
 
+from hwp_bench.base.arrays import evenly
 from hwp_bench.base.errors import BadInput
-from hwp_bench.base.evenly import evenly
 from hwp_bench.capture import Cameras
 from hwp_bench.hands import HandParameters
 from hwp_bench.methods.contract import TrainingCapture

@@ -9,21 +9,18 @@ normal, and its colour is multiplied by the ratio of both irradiances.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from typing import Annotated, ClassVar
 
 import numpy as np
 import torch
 from scipy.optimize import nnls
 from torch import Tensor
 
-from hwp_bench.base.errors import BadInput
-from wildghand.gaussians.kept_tensors import kept_tensor
+from wildghand.gaussians.found import Found, Kept
 from wildghand.light.settings import LightSettings
 from wildghand.light.sphere import spread_directions
 
-# Names under which an avatar keeps a light.
-_PREFIX = "light_"
 # Turns of albedo and light.
 _TURNS = 12
 # Irradiances below this share of the mean are as dark; ratios beyond these are cut.
@@ -35,8 +32,8 @@ _SRGB = 1.0 / 2.2
 _RIM, _FRONT = 0.0, 0.2
 # Cosine over which the unknown begins.
 _SOFT = 0.1
-# Most directions that are read.
-_MOST_DIRECTIONS = 4096
+# Bounds of what is read: parts of unit vectors, and strengths.
+_UNIT, _LARGEST = 1.001, 1e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,19 +51,21 @@ class LightSamples:
 
 
 @dataclass(frozen=True, eq=False)
-class KnownLight:
+class KnownLight(Found):
     """A light, and the cap of the sphere of normals in which frames have shown it."""
 
+    prefix = "light_"
+    longest: ClassVar = {"K": 4096}
     #: (K, 3) unit vectors towards the light.
-    directions: Tensor
+    directions: Annotated[Tensor, Kept(("K", 3), -_UNIT, _UNIT)]
     #: (K,) strength of the light from each of them; the mean irradiance of the samples is 1.
-    strengths: Tensor
+    strengths: Annotated[Tensor, Kept(("K",), 0.0, _LARGEST)]
     #: () strength of the light from everywhere.
-    ambient: Tensor
+    ambient: Annotated[Tensor, Kept((), 0.0, _LARGEST)]
     #: (3,) middle of the known normals, a unit vector.
-    axis: Tensor
+    axis: Annotated[Tensor, Kept((3,), -_UNIT, _UNIT)]
     #: () cosine of the cap's angle.
-    cosine: Tensor
+    cosine: Annotated[Tensor, Kept((), -_UNIT, _UNIT)]
 
     def irradiance(self, normals: Tensor) -> Tensor:
         """E(n) of unit normals (..., 3), positive: (...)."""
@@ -99,38 +98,6 @@ class KnownLight:
         """
         beyond = ((self.cosine - normals @ self.axis) / _SOFT).clamp(0.0, 1.0)
         return beyond * ((facing - _RIM) / (_FRONT - _RIM)).clamp(0.0, 1.0)
-
-    def to_tensors(self) -> dict[str, Tensor]:
-        """The fields by the names under which an avatar keeps them."""
-        return {f"{_PREFIX}{item.name}": getattr(self, item.name) for item in fields(self)}
-
-    @classmethod
-    def from_tensors(cls, tensors: Mapping[str, Tensor], where: str) -> KnownLight | None:
-        """Read what `to_tensors` made.
-
-        Args:
-            tensors: of an avatar.
-            where: the file, for messages.
-
-        Returns:
-            The light; None where the avatar keeps none.
-
-        Raises:
-            BadInput: a part is missing, of another shape, or no light.
-        """
-        if f"{_PREFIX}directions" not in tensors:
-            return None
-        directions, found = tensors[f"{_PREFIX}directions"], {}
-        count = len(directions) if directions.ndim == 2 else 0
-        shapes = {"directions": (count, 3), "strengths": (count,), "ambient": ()}
-        shapes |= {"axis": (3,), "cosine": ()}
-        for name, shape in shapes.items():
-            field = f"{_PREFIX}{name}"
-            if not 0 < count <= _MOST_DIRECTIONS:
-                raise BadInput(f"has not the shape {shape}", where=where, field=field)
-            bounds = (-1.001, 1.001) if name in ("directions", "axis", "cosine") else (0.0, 1e6)
-            found[name] = kept_tensor(tensors, field, shape, bounds, where).float()
-        return cls(**found)
 
 
 def fit_light(samples: LightSamples, settings: LightSettings) -> KnownLight | None:

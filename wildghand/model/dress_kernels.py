@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from hwp_bench.base.compiled import compiled
+from hwp_bench.base.kernels import compiled
 from wildghand.splat.kernels.jit import next_job
 
 #: Gaussians that one thread takes at a time.

@@ -99,10 +99,9 @@ class WildGHandModel(nn.Module):
         for name, values in found.to_tensors().items():
             self.register_buffer(name, values.to(self.log_gains.device))
         if isinstance(found, KnownLight):
-            self.light = KnownLight.from_tensors(dict(self.named_buffers()), "light")
+            self.light = found.to(self.log_gains.device)
         if isinstance(found, Evidence):
-            counts = {side: len(rig) for side, rig in self.rigs.items()}
-            self.evidence = Evidence.from_tensors(dict(self.named_buffers()), counts, "evidence")
+            self.evidence = found.to(self.log_gains.device)
             walls = {side: WristWall.of(rig) for side, rig in self.rigs.items()}
             self._walls = {side: wall for side, wall in walls.items() if wall is not None}
         if isinstance(found, ClipPoses):

@@ -12,9 +12,8 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
-from hwp_bench.base.errors import BadMethod
+from hwp_bench.base.errors import BadMethod, nearest
 from hwp_bench.base.records import flattened, merged
-from hwp_bench.base.text import nearest
 from hwp_bench.methods.settings import check_source, choice, number, settings_from
 from wildghand.dpd.dpd import DpdSettings
 from wildghand.evidence import EvidenceSettings

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from hwp_bench.hands import TemplateTensors, anchor_positions, pose_hand
-from hwp_bench.hands.topology import boundary_loop
+from hwp_bench.hands.template import boundary_loop
 from wildghand.gaussians.quaternions import matrix_to_quat
 from wildghand.gaussians.rig import HandRig
 from wildghand.model.dress import Gaussians

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
+import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
@@ -16,13 +18,19 @@ from hwp_bench.base.files import atomic_write
 from hwp_bench.capture import Capture
 from hwp_bench.report.page.render import render_template
 from wildghand.avatar import WildGHandAvatar, load_avatar
-from wildghand.evidence import Evidence
-from wildghand.page.bake import BakedHand, PoseBasis, bake_hand
-from wildghand.page.biases import FrameBiases, bake_biases
-from wildghand.page.measure import Fidelity, fidelity, still_image
-from wildghand.page.poses import PoseSamples, hand_controls, sample_poses
-from wildghand.page.settings import PageSettings
-from wildghand.page.weights import mean_weights
+from wildghand.avatar.avatar import InlinePicture
+from wildghand.avatar.studio import REST
+from wildghand.page.bake import BakedHand, FrameBiases, PoseBasis, bake_biases, bake_hand
+from wildghand.page.poses import (
+    Fidelity,
+    PageSettings,
+    PoseSamples,
+    fidelity,
+    hand_controls,
+    mean_weights,
+    sample_poses,
+    still_image,
+)
 
 if TYPE_CHECKING:
     from markupsafe import Markup
@@ -104,6 +112,26 @@ def write_page(
     )
 
 
+def show_page(avatar: WildGHandAvatar, *, size: int = 320) -> InlinePicture:
+    """Show in a notebook the page on which an avatar is turned and posed.
+
+    It adds some megabytes to the notebook, and takes some seconds to write. Where a notebook shows
+    no pages there is a picture of the hand at rest.
+
+    Args:
+        avatar: the avatar.
+        size: edge of the picture, px.
+
+    Raises:
+        UsageError: the size is out of range.
+    """
+    picture = avatar.show(REST, size=size)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "avatar.html"
+        write_page(avatar, path)
+        return dataclasses.replace(picture, page=path.read_text("utf-8"))
+
+
 def _html(
     avatar: WildGHandAvatar,
     hands: Mapping[str, BakedHand],
@@ -181,10 +209,7 @@ def _seen(avatar: WildGHandAvatar, side: str, count: int) -> str | None:
     255 is the share of the frames at which the fit keeps half of an offset from the skin
     (`wildghand.evidence`), or more of them.
     """
-    rigs, buffers = avatar.model.rigs, dict(avatar.model.named_buffers())
-    evidence = Evidence.from_tensors(
-        buffers, {name: len(rig) for name, rig in rigs.items()}, "avatar"
-    )
+    evidence = avatar.model.evidence
     if evidence is None:
         return None
     kept = evidence.offsets[side].double().cpu().numpy()

@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from hwp_bench.base.progress import notice
+from hwp_bench.base.console import notice
 from hwp_bench.methods.contract import Avatar, Budget, Report
 from wildghand.gaussians.adam import ClippedAdam
 from wildghand.gaussians.fit_loop import Guard, StepThreads, batches, repeatable, spent

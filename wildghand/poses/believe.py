@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from hwp_bench.base.evenly import evenly
+from hwp_bench.base.arrays import evenly
 from hwp_bench.capture import Cameras
 from hwp_bench.hands import HandParameters, HandTemplate
-from hwp_bench.hands.posed_skeleton import turned
-from hwp_bench.hands.rotations import right_jacobian
+from hwp_bench.hands.articulation import right_jacobian
+from hwp_bench.hands.poses import turned
 from wildghand.poses.landmark_errors import (
     extent_in,
     in_front,

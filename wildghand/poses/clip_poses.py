@@ -5,29 +5,29 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
-import torch
 
-from hwp_bench.base.errors import BadInput
 from hwp_bench.hands import HandParameters, HandPose
+from wildghand.gaussians.found import Found, Kept
 
-# Names under which an avatar keeps them, before the side.
-_GIVEN, _BELIEVED = "poses_given_", "poses_believed_"
-# Pose and translation of a hand.
-_NUMBERS = 51
+# Largest number that is read, as in a capture, rad or m.
+_LARGEST = 1e6
+_Tables = Annotated[Mapping[str, np.ndarray], Kept(("F", 51), -_LARGEST, _LARGEST)]
 
 
 @dataclass(frozen=True, eq=False)
-class ClipPoses:
+class ClipPoses(Found):
     """Poses of the frames of a clip by side, (F, 51) float32: 16 axis-angle vectors and transl.
 
     A pose that was given by an estimator is told by its numbers, all of them: no other pose is
     changed.
     """
 
-    given: Mapping[str, np.ndarray]
-    believed: Mapping[str, np.ndarray]
+    prefix = "poses_"
+    given: _Tables
+    believed: _Tables
 
     @functools.cached_property
     def _rows(self) -> dict[str, dict[bytes, int]]:
@@ -61,40 +61,6 @@ class ClipPoses:
             return hand
         numbers = self.believed[side][row].astype(np.float64)
         return replace(hand, pose=numbers[:48].reshape(16, 3), transl=numbers[48:])
-
-    def to_tensors(self) -> dict[str, torch.Tensor]:
-        """As tensors, by the names under which an avatar keeps them."""
-        return {
-            f"{name}{side}": torch.from_numpy(poses[side])
-            for name, poses in ((_GIVEN, self.given), (_BELIEVED, self.believed))
-            for side in poses
-        }
-
-    @classmethod
-    def from_tensors(
-        cls, tensors: Mapping[str, torch.Tensor], sides: tuple[str, ...], where: str
-    ) -> ClipPoses | None:
-        """Read what `to_tensors` made; None where an avatar keeps none.
-
-        Raises:
-            BadInput: they have the wrong shape.
-        """
-        found: dict[str, dict[str, np.ndarray]] = {_GIVEN: {}, _BELIEVED: {}}
-        for side in sides:
-            kept = [tensors.get(f"{name}{side}") for name in found]
-            if all(tensor is None for tensor in kept):
-                continue
-            shapes = {None if tensor is None else tuple(tensor.shape) for tensor in kept}
-            if len(shapes) > 1 or not all(shape and shape[1:] == (_NUMBERS,) for shape in shapes):
-                raise BadInput(
-                    f"and the believed ones are not two tables of {_NUMBERS} numbers a frame",
-                    where=where,
-                    field=f"{_GIVEN}{side}",
-                )
-            for name, tensor in zip(found, kept, strict=True):
-                assert tensor is not None
-                found[name][side] = tensor.float().cpu().numpy()
-        return cls(found[_GIVEN], found[_BELIEVED]) if found[_GIVEN] else None
 
 
 def _numbers(pose: np.ndarray, transl: np.ndarray) -> np.ndarray:

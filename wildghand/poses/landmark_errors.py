@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from hwp_bench.hands import HandParameters, HandTemplate
-from hwp_bench.hands.posed_skeleton import (
+from hwp_bench.hands.articulation import right_jacobian
+from hwp_bench.hands.poses import (
     DEGREES,
     PosedSkeleton,
     hand_extent,
@@ -13,7 +14,6 @@ from hwp_bench.hands.posed_skeleton import (
     posed_skeleton,
     rest_skeleton,
 )
-from hwp_bench.hands.rotations import right_jacobian
 from wildghand.poses.settings import PoseSettings
 
 # A landmark nearer to the camera says nothing of where it lies in the image, m.

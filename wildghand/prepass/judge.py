@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hwp_bench.base.errors import BadInput
-from hwp_bench.hands.footprint import Footprint, HandSurfaces
+from hwp_bench.hands.anchors import Footprint, HandSurfaces
 from wildghand.prepass.assessment import FrameAssessment, enlarged, neutral_assessment
 from wildghand.prepass.borders import ShownCells, border_width, misplacement
 from wildghand.prepass.classify import classify_frames, clip_tolerance, evidence_against

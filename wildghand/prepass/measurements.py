@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from hwp_bench.hands.footprint import Footprint
+from hwp_bench.hands.anchors import Footprint
 from wildghand.prepass.borders import ShownCells, interior
 from wildghand.prepass.intensity import HIGHEST, LOWEST, IntensityModel, log_light_table
 

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hwp_bench.base.progress import notice
+from hwp_bench.base.console import notice
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.optimize import Watchers

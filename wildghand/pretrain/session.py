@@ -8,10 +8,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from hwp_bench.base.console import notice, progress
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import sha256_file, sha256_json
-from hwp_bench.base.locks import exclusive
-from hwp_bench.base.progress import notice, progress
+from hwp_bench.base.folders import exclusive
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.methods.contract import REQUEST, Budget, RunSettings
 from hwp_bench.methods.request import open_request, write_request

@@ -10,9 +10,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from hwp_bench.base.arrays import read_tensors
 from hwp_bench.base.errors import BadInput, HwpError
 from hwp_bench.base.files import read_json, sha256_json, sha256_of
-from hwp_bench.base.tensor_files import read_tensors
 from wildghand.sam.network import SamNetwork
 from wildghand.sam.sizes import DECODER_HEADS, decoder_sizes, encoder_sizes
 

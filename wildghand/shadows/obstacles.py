@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from hwp_bench.base.ray_mesh import ray_mesh
+from hwp_bench.base.rays import ray_mesh
 
 #: How far a ray starts from the skin, m: the surface of an estimated hand is not exact, and a
 #: fold must not shade itself.

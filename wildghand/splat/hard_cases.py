@@ -181,12 +181,16 @@ def _draw(scene: HardScene, context: Context, weights: torch.Tensor | None = Non
     return draw(scene, context.backend, dtype, weights)
 
 
-def run_exact(scene: HardScene, own: float, gsplat: float, context: Context) -> Measured:
-    """As float64 draws it; gradients within `own`, those of gsplat within `gsplat`."""
-    tolerance = gsplat if context.backend == "gsplat" else own
+def _beside_float64(
+    scene: HardScene, context: Context, tolerance: float, dtype: torch.dtype | None = None
+) -> Measured:
+    """How far a drawing, and its gradients, are from the reference in the pixels that are clear."""
     clear = clear_pixels(scene)
     truth = draw(scene, "reference", torch.float64, clear)
-    drawing = _draw(scene, context, clear)
+    if dtype is None:
+        drawing = _draw(scene, context, clear)
+    else:
+        drawing = draw(scene, context.backend, dtype, clear)
     mask = clear.unsqueeze(-1)
     image = max(
         difference(drawing.image * mask, truth.image * mask),
@@ -197,6 +201,11 @@ def run_exact(scene: HardScene, own: float, gsplat: float, context: Context) -> 
     near = image <= IMAGE_TOLERANCE and gradients[worst] <= tolerance
     passed = drawing.finite and (near or math.isinf(tolerance))
     return Measured(passed, f"image {image:.0e}, gradients {gradients[worst]:.0e} ({worst})")
+
+
+def run_exact(scene: HardScene, own: float, gsplat: float, context: Context) -> Measured:
+    """As float64 draws it; gradients within `own`, those of gsplat within `gsplat`."""
+    return _beside_float64(scene, context, gsplat if context.backend == "gsplat" else own)
 
 
 def run_no_effect(scene: HardScene, context: Context) -> Measured:
@@ -240,21 +249,11 @@ def run_bad_view(scene: HardScene, context: Context) -> Measured:
 
 def run_narrow(dtype: torch.dtype, context: Context) -> Measured:
     """Arguments of a narrow type are drawn as the same numbers in float64."""
-    scene = hand_scene()
-    narrow = {name: value.to(dtype) for name, value in scene.arguments.items()}
     # The same numbers, so that what the type cannot hold does not count.
-    same = scene.changed(**{name: value.double() for name, value in narrow.items()})
-    clear = clear_pixels(same)
-    truth = draw(same, "reference", torch.float64, clear)
-    drawing = draw(same, context.backend, dtype, clear)
-    mask = clear.unsqueeze(-1)
-    off = difference(drawing.image * mask, truth.image * mask)
+    narrow = {name: value.to(dtype).double() for name, value in hand_scene().arguments.items()}
     # Half an ulp of the type is added when a gradient is given back in it.
     allowed = GRADIENT_TOLERANCE + torch.finfo(dtype).eps
-    gradients = gradient_differences(drawing.gradients, truth)
-    worst = max(gradients, key=lambda name: gradients[name])
-    passed = drawing.finite and off <= IMAGE_TOLERANCE and gradients[worst] <= allowed
-    return Measured(passed, f"image {off:.0e}, gradients {gradients[worst]:.0e} ({worst})")
+    return _beside_float64(HardScene(narrow), context, allowed, dtype)
 
 
 def run_strided(context: Context) -> Measured:

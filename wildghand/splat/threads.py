@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from hwp_bench.base.denormals import flushes, set_flush
+from hwp_bench.base.numerics import flushes, set_flush
 from wildghand.splat.kernels.jit import SPACING
 
 #: Work, in Gaussians or (Gaussian, tile) pairs, that outweighs waking a thread (some 0.1 ms).

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.linalg import solve
 
-from hwp_bench.base.evenly import evenly
+from hwp_bench.base.arrays import evenly
 from hwp_bench.capture import Cameras
 from hwp_bench.hands import HandParameters, HandTemplate
 from wildghand.subject.compared_frames import ComparedFrames

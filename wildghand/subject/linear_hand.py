@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hwp_bench.hands.skeleton import PARENTS
-from hwp_bench.hands.template import JOINT_COUNT
+from hwp_bench.hands.skeleton import JOINT_COUNT, PARENTS
 
 
 def vertex_turns(turns: np.ndarray, weights: np.ndarray) -> np.ndarray:

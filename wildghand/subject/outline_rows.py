@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hwp_bench.hands.template import JOINT_COUNT
+from hwp_bench.hands.skeleton import JOINT_COUNT
 from wildghand.subject.compared_frames import ComparedFrames, PosedFrames
 from wildghand.subject.linear_hand import joint_turns, vertex_turns
 from wildghand.subject.outlines import OutlinePoints

@@ -11,8 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from hwp_bench.hands import HandTemplate
-from hwp_bench.hands.skeleton import FINGERS, finger_joints, moved_joints, palm_directions
-from hwp_bench.hands.template import JOINT_COUNT
+from hwp_bench.hands.skeleton import (
+    FINGERS,
+    JOINT_COUNT,
+    finger_joints,
+    moved_joints,
+    palm_directions,
+)
 from wildghand.subject.shape import side_flip
 
 

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hwp_bench.hands import HandTemplate
-from hwp_bench.hands.skeleton import PARENTS
-from hwp_bench.hands.template import JOINT_COUNT
+from hwp_bench.hands.skeleton import JOINT_COUNT, PARENTS
 from wildghand.subject.control_points import ControlPoints, place_control_points
 from wildghand.subject.proportions import Proportions, hand_proportions
 from wildghand.subject.settings import SubjectSettings

@@ -4,21 +4,58 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hwp_bench.base.progress import notice
+from hwp_bench.base.console import notice
+from hwp_bench.base.drawing import PAPER, fitted, labelled
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.glance import Glance, glance
 from wildghand.gaussians.fit_loop import Loss
-from wildghand.viewer.live_sheet import live_sheet
 from wildghand.viewer.server import Address, serving, url
 
 if TYPE_CHECKING:
     from viser import ClientHandle, ViserServer
+
+
+#: Larger side of each of the three pictures, px.
+TILE = 384
+_GAP = 8
+
+
+def live_sheet(look: Glance, aspect: float) -> np.ndarray:
+    """Return the three pictures of a glance on a sheet.
+
+    Returns:
+        (H, W, 3) uint8, H and W as `aspect` asks for.
+    """
+    names = (f"frame {look.frame}", f"avatar, {look.psnr:.1f} dB", "weights of pixels")
+    pictures = (look.truth, look.avatar, np.repeat(look.weights[..., None], 3, axis=2))
+    tiles = [
+        labelled(fitted(image, TILE), name) for image, name in zip(pictures, names, strict=True)
+    ]
+    height, width = tiles[0].shape[:2]
+    rows = [_line(tiles, 1), _line(tiles, 0)]
+    inner = max(rows, key=lambda line: min(aspect / line.shape[1], 1.0 / line.shape[0]))
+    height, width = inner.shape[:2]
+    full = max(height, round(width / aspect)), max(width, round(height * aspect))
+    page = np.full((*full, 3), PAPER, dtype=np.uint8)
+    top, left = (full[0] - height) // 2, (full[1] - width) // 2
+    page[top : top + height, left : left + width] = inner
+    return page
+
+
+def _line(tiles: Sequence[np.ndarray], axis: int) -> np.ndarray:
+    """Tiles with gaps around them, along an axis of the picture."""
+    padded = [
+        np.pad(tile, ((_GAP, _GAP), (_GAP, _GAP), (0, 0)), constant_values=PAPER[0])
+        for tile in tiles
+    ]
+    return np.concatenate(padded, axis=axis)
+
 
 #: Least seconds between two pictures, and the largest share of the time that goes into them.
 LEAST_PAUSE, SHARE = 1.0, 0.1

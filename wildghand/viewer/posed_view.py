@@ -1,19 +1,297 @@
-"""The state of a view of an avatar: its hands, the background, and how they are drawn."""
+"""An avatar that is posed and drawn for a page: cameras, motion, pictures, and their state.
+
+The camera of a page and ours are both pinholes with OpenCV axes.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 import threading
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
 
-from hwp_bench.methods.contract import Camera
-from wildghand.avatar.avatar import WildGHandAvatar
-from wildghand.viewer.cameras import Viewpoint, viewpoint
-from wildghand.viewer.motion import Motion
-from wildghand.viewer.painter import Painter, Picture
-from wildghand.viewer.posing import Hands, with_angle, with_fingers
+from hwp_bench.capture import Capture
+from hwp_bench.capture.schema import METADATA
+from hwp_bench.methods.contract import Camera, HandPose
+from wildghand.avatar.avatar import PosedGaussians, WildGHandAvatar, over
+from wildghand.avatar.render import shown_sides
+from wildghand.avatar.studio import HandAngles
+from wildghand.splat import rasterize
+from wildghand.splat.threads import denormals_flushed
+
+
+@dataclass(frozen=True, eq=False)
+class PageCamera:
+    """The camera of a page, as it was last told."""
+
+    #: (4,) (w, x, y, z), camera to world.
+    wxyz: np.ndarray
+    #: (3,) m, world.
+    position: np.ndarray
+    #: Vertical field of view, rad.
+    fov: float
+    #: Of the page's picture, px.
+    width: int
+    #: Of the page's picture, px.
+    height: int
+
+    def sound(self) -> bool:
+        """Whether a picture can be drawn for it: a page's numbers are not ours."""
+        numbers = [*np.ravel(self.wxyz), *np.ravel(self.position), self.fov]
+        return (
+            all(math.isfinite(number) for number in numbers)
+            and float(np.linalg.norm(self.wxyz)) > 1e-6
+            and 0.01 < self.fov < 3.1
+            and min(self.width, self.height) >= 1
+            and max(self.width, self.height) < 100 * min(self.width, self.height)
+        )
+
+    def camera(self, edge: int) -> Camera:
+        """Return our camera for a picture whose larger side is at most `edge` px.
+
+        The picture has the page's shape up to a pixel, and is never larger than the page's own.
+        """
+        scale = min(1.0, edge / max(self.width, self.height))
+        width = max(1, round(scale * self.width))
+        height = max(1, round(scale * self.height))
+        # The page stretches the picture to its own shape, so each axis has a focal length.
+        focal = 0.5 / math.tan(0.5 * self.fov)
+        K = np.array(
+            [
+                [focal * self.height * width / self.width, 0.0, 0.5 * width],
+                [0.0, focal * height, 0.5 * height],
+                [0.0, 0.0, 1.0],
+            ]
+        )
+        w, x, y, z = np.asarray(self.wxyz, dtype=np.float64)
+        turn = Rotation.from_quat([x, y, z, w]).inv().as_matrix()
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = turn
+        viewmat[:3, 3] = -turn @ np.asarray(self.position, dtype=np.float64)
+        return Camera(K, viewmat, width, height)
+
+
+@dataclass(frozen=True, eq=False)
+class Viewpoint:
+    """Where a page's camera is put."""
+
+    #: (3,) m, world.
+    position: np.ndarray
+    #: (3,) m, the point that it looks at and turns about.
+    look_at: np.ndarray
+    #: (3,) direction that is up in the picture.
+    up: np.ndarray
+    #: Vertical field of view, rad.
+    fov: float
+
+
+def viewpoint(camera: Camera, centre: np.ndarray) -> Viewpoint:
+    """Return the viewpoint of one of our cameras.
+
+    Args:
+        centre: (3,) m, world, about what the page's camera turns; the nearest point to it on the
+            camera's axis is taken, so that the picture stays the camera's.
+    """
+    turn, shift = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
+    position, ahead = -turn.T @ shift, turn[2]
+    depth = max(float((np.asarray(centre) - position) @ ahead), 1e-2)
+    fov = 2.0 * math.atan(0.5 * camera.height / float(camera.K[1, 1]))
+    return Viewpoint(position, position + depth * ahead, -turn[1], fov)
+
+
+class Motion:
+    """The motion of a capture, for the hands that an avatar has.
+
+    Args:
+        avatar: what moves.
+        capture: whose hand parameters and cameras are used.
+
+    Raises:
+        UsageError: the capture shows no hand that the avatar has, or belongs to another hand
+            model.
+    """
+
+    def __init__(self, avatar: WildGHandAvatar, capture: Capture) -> None:
+        self._avatar, self._capture = avatar, capture
+        self._sides = shown_sides(avatar, capture)
+        self.fps = capture.info.fps
+
+    def __len__(self) -> int:
+        return self._capture.info.frame_count
+
+    def hands(self, frame: int) -> dict[str, HandPose]:
+        """Return the hands of a frame, by side, in the poses that the avatar believes in."""
+        poses = self._avatar.believed(self._capture.hand_poses(frame))
+        return {side: poses[side] for side in self._sides}
+
+    def camera(self, frame: int) -> Camera:
+        """Return the camera of a frame."""
+        return self._capture.camera(frame)
+
+
+def capture_of(avatar: Path) -> Path | None:
+    """Return the capture folder that lies with an avatar folder, as a fit of a video leaves it."""
+    for folder in (avatar / "work" / "capture", avatar.with_name(avatar.name + ".capture")):
+        if (folder / METADATA).is_file():
+            return folder
+    return None
+
+
+#: Hands as they are shown, by side.
+Hands = Mapping[str, HandPose]
+
+
+def with_angle(
+    hands: Hands, angles: HandAngles, joint: int, angle: int, degrees: float
+) -> dict[str, HandPose]:
+    """Return hands of which one has another angle; everything else stays.
+
+    Args:
+        degrees: cut to the range of the joint.
+    """
+    hand = hands[angles.side]
+    found = angles.angles(hand.pose)
+    found[joint, angle] = np.clip(degrees, angles.lower[joint, angle], angles.upper[joint, angle])
+    return {**hands, angles.side: dataclasses.replace(hand, pose=angles.pose(found))}
+
+
+def with_fingers(
+    hands: Hands, angles: Mapping[str, HandAngles], named: Mapping[str, np.ndarray]
+) -> dict[str, HandPose]:
+    """Return hands with other fingers, where they are and as they are turned.
+
+    Args:
+        named: (16, 3) degrees by side; the wrist's are left out.
+    """
+    changed = {}
+    for side, hand in hands.items():
+        pose = angles[side].pose(named[side])
+        pose[0] = hand.pose[0]
+        changed[side] = dataclasses.replace(hand, pose=pose)
+    return changed
+
+
+def shown_angles(hand: HandPose, angles: HandAngles) -> np.ndarray:
+    """Return the angles of a hand as sliders show them.
+
+    Returns:
+        (16, 3) degrees to a tenth, within the ranges: a tracked pose may lie outside of them.
+    """
+    return np.round(angles.angles(hand.pose), 1).clip(angles.lower, angles.upper)
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A picture and what it cost."""
+
+    #: (H, W, 3) uint8 sRGB.
+    image: np.ndarray
+    #: Whether it is a draft.
+    draft: bool
+    #: Seconds that went into its pixels.
+    pixels: float
+    #: Seconds that went into everything else.
+    other: float
+
+    @property
+    def edge(self) -> int:
+        """Its larger side, px."""
+        return max(self.image.shape[:2])
+
+
+class Painter:
+    """Draws an avatar with the rasterizer that fits and scores it.
+
+    A draft leaves out what depends on the camera (the light of normals that no frame has shown),
+    and keeps the Gaussians for as long as the hands stay: turning the camera costs pixels only.
+
+    Args:
+        avatar: what is drawn; one thread at a time may use it.
+    """
+
+    def __init__(self, avatar: WildGHandAvatar) -> None:
+        self._avatar = avatar
+        self._posed: tuple[Hands, PosedGaussians] | None = None
+
+    def full(self, hands: Hands, camera: Camera, background: tuple[int, int, int]) -> Picture:
+        """Draw as `wildghand render` does."""
+        began = time.perf_counter()
+        image = over(self._avatar.render(hands, camera), background)
+        return Picture(image, False, time.perf_counter() - began, 0.0)
+
+    @denormals_flushed()
+    @torch.no_grad()
+    def draft(self, hands: Hands, camera: Camera, background: tuple[int, int, int]) -> Picture:
+        """Draw sooner; see `full`."""
+        began = time.perf_counter()
+        if self._posed is None or self._posed[0] is not hands:
+            self._posed = hands, self._avatar.pose(hands, closed=True)
+        posed, entered = self._posed[1], time.perf_counter()
+        device = torch.device(self._avatar.device)
+
+        def tensor(array: np.ndarray) -> torch.Tensor:
+            return torch.as_tensor(array, dtype=torch.float32, device=device)
+
+        colors, coverage, _ = rasterize(
+            tensor(posed.means),
+            tensor(posed.quats),
+            tensor(posed.scales),
+            tensor(posed.opacities),
+            tensor(posed.colors),
+            tensor(camera.viewmat)[None],
+            tensor(camera.K)[None],
+            camera.width,
+            camera.height,
+        )
+        rgba = torch.cat((colors, coverage), dim=-1)[0].clamp(0.0, 1.0).nan_to_num(0.0)
+        image = over(rgba.cpu().numpy(), background)
+        return Picture(image, True, time.perf_counter() - entered, entered - began)
+
+
+class Player:
+    """Goes from frame to frame; where drawing is slower, frames are left out.
+
+    Args:
+        count: frames, which are played round and round.
+        fps: frames per second at speed 1.
+        show: takes the frame that is due.
+    """
+
+    def __init__(self, count: int, fps: float, show: Callable[[int], None]) -> None:
+        self._count, self._fps, self._show = count, fps, show
+        #: Times the speed of the clip.
+        self.speed = 1.0
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def play(self, frame: int) -> None:
+        """Begin at a frame; does nothing while it plays."""
+        if self._thread is None:
+            self._stop.clear()
+            self._thread = threading.Thread(target=self._run, args=(frame,), daemon=True)
+            self._thread.start()
+
+    def stop(self) -> None:
+        """Stop, and wait until it has."""
+        thread, self._thread = self._thread, None
+        if thread is not None:
+            self._stop.set()
+            thread.join(timeout=10.0)
+
+    def _run(self, frame: int) -> None:
+        place, before = float(frame), time.monotonic()
+        while not self._stop.wait(1.0 / self._fps):
+            now = time.monotonic()
+            place, before = place + (now - before) * self._fps * self.speed, now
+            self._show(int(place) % self._count)
+
 
 #: Edge of the picture that gets everything compiled before a page asks, px.
 _FIRST_EDGE = 64

@@ -2,20 +2,49 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from hwp_bench.base.progress import notice
+from hwp_bench.base.console import notice
 from hwp_bench.methods.contract import Camera
-from wildghand.viewer.cameras import PageCamera, Viewpoint
-from wildghand.viewer.pace import Pace
-from wildghand.viewer.painter import Picture
+from wildghand.viewer.posed_view import PageCamera, Picture, Viewpoint
 
 if TYPE_CHECKING:
     from viser import CameraHandle, ClientHandle, ViserServer
+
+
+#: Seconds that a picture may take while something moves: some ten pictures a second.
+TARGET = 0.09
+#: Smallest and largest edge of such a picture, px.
+LEAST, MOST = 128, 768
+
+
+class Pace:
+    """Follows how long pictures take, and says how large the next one may be.
+
+    Args:
+        edge: of the first picture, px.
+    """
+
+    def __init__(self, edge: int = 256) -> None:
+        self.edge = edge
+
+    def took(self, edge: int, pixels: float, other: float) -> None:
+        """Take note of a picture.
+
+        Args:
+            edge: its larger side, px.
+        """
+        # At least a third of the time goes to the pixels: smaller pictures would not help.
+        left = max(TARGET - other, TARGET / 3)
+        wanted = edge * math.sqrt(left / max(pixels, 1e-4))
+        # Halfway, so that one slow picture on a busy machine does not make the next one tiny.
+        self.edge = round(min(max(math.sqrt(self.edge * wanted), LEAST), MOST))
+
 
 #: Seconds without a change after which the full picture is drawn.
 SETTLE = 0.25

@@ -1,20 +1,77 @@
-"""The web server of a view: viser, on this machine only unless asked otherwise."""
+"""The web server of a view: viser, on this machine only unless asked otherwise.
+
+A browser lets any web page open a WebSocket to this machine. Viser answers all of them, so that a
+page elsewhere could look at the hand of a person who has a view open; `guarded` refuses pages that
+the view itself has not served.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import functools
+import http
+import inspect
 import socket
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
 from hwp_bench.base.errors import MissingDependency, UsageError
-from wildghand.viewer.guard import LOOPBACK, guarded
 
 if TYPE_CHECKING:
     from viser import ViserServer
+
+
+#: Names of this machine for itself.
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+
+
+def refusal(headers: Mapping[str, str], loopback: bool) -> str | None:
+    """Say why a request is refused; None where it is answered."""
+    host = headers.get("Host", "")
+    if loopback and urlsplit(f"//{host}").hostname not in LOOPBACK:
+        return "This view is for the machine that it runs on."
+    origin = headers.get("Origin")
+    if origin is not None and urlsplit(origin).netloc.lower() != host.lower():
+        return "This page was not served by the view."
+    return None
+
+
+@contextlib.contextmanager
+def guarded(loopback: bool) -> Iterator[None]:
+    """Within this, servers of the package `websockets` that are started refuse other pages.
+
+    Viser has no setting for it; it starts its server while its object is made.
+    """
+    from websockets.asyncio import server
+
+    serve = server.serve
+
+    @functools.wraps(serve)
+    def guarded_serve(*args: Any, process_request: Any = None, **options: Any) -> Any:
+        return serve(*args, process_request=_first_asked(process_request, loopback), **options)
+
+    setattr(server, "serve", guarded_serve)  # noqa: B010  mypy knows a class there
+    try:
+        yield
+    finally:
+        setattr(server, "serve", serve)  # noqa: B010
+
+
+def _first_asked(then: Any, loopback: bool) -> Callable[[Any, Any], Any]:
+    """A `process_request` of websockets that refuses, or goes on with another one."""
+
+    async def process(connection: Any, request: Any) -> Any:
+        reason = refusal(request.headers, loopback)
+        if reason is not None:
+            return connection.respond(http.HTTPStatus.FORBIDDEN, reason + "\n")
+        answer: Any = then(connection, request) if then is not None else None
+        return await answer if inspect.isawaitable(answer) else answer
+
+    return process
 
 
 #: A web socket waits ten seconds for a browser that does not say goodbye; viser waits six for it.
@@ -37,11 +94,7 @@ class Address:
 
 
 def require_viser() -> None:
-    """Check that the extra is installed, before work begins.
-
-    Raises:
-        MissingDependency: it is not.
-    """
+    """Check that the extra is installed, before work begins."""
     try:
         import viser  # noqa: F401
     except ImportError as error:
@@ -53,16 +106,7 @@ def require_viser() -> None:
 
 @contextlib.contextmanager
 def serving(address: Address, title: str) -> Iterator[ViserServer]:
-    """Serve a page while the block runs; standard output stays free of viser's own messages.
-
-    Args:
-        address: where.
-        title: over the panel of the page.
-
-    Raises:
-        MissingDependency: viser is not installed.
-        UsageError: the address cannot be used.
-    """
+    """Serve a page while the block runs; standard output stays free of viser's own messages."""
     require_viser()
     _check(address)
     import viser

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, max_pool2d
 
-from hwp_bench.base.nearest import kd_tree
+from hwp_bench.base.numerics import kd_tree
 from wildghand.evidence.count import seen_anchors
 from wildghand.gaussians.rig import AnchorPoses
 

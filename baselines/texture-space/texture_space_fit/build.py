@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
+from hwp_bench.base.console import track
 from hwp_bench.base.files import atomic_write
-from hwp_bench.base.progress import track
 from hwp_bench.sim.scene.looks import Looks
 from hwp_bench.sim.scene.schema import Subject
 from hwp_bench.sim.subject.atlas import painted_atlas

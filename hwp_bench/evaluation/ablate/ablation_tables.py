@@ -21,7 +21,7 @@ from hwp_bench.base.tables import Cell, Column, Table, to_object
 from hwp_bench.evaluation.ablate.effects import CostEffect, ScoreEffect, seconds
 from hwp_bench.evaluation.ablate.runs import AblationRuns, result_folder
 from hwp_bench.metrics import metric as metric_facts
-from hwp_bench.metrics.aggregate import Scores, aggregate
+from hwp_bench.metrics.score import Scores, aggregate
 from hwp_bench.report.evaluation_tables import HEADLINE, PAPER
 from hwp_bench.results import Results
 from hwp_bench.results.schema import score_rows

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from itertools import combinations, product
 from typing import Any
 
-from hwp_bench.base.errors import UsageError
-from hwp_bench.base.text import did_you_mean
+from hwp_bench.base.errors import UsageError, did_you_mean
 from hwp_bench.methods.manifest import MANIFEST, MethodManifest, Switch
 
 #: Components that are crossed when nothing is asked for and the method names none.

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from hwp_bench.analysis.statistics.pairing import MethodRuns
-from hwp_bench.base.locks import exclusive
+from hwp_bench.base.folders import exclusive
 from hwp_bench.capture.splits import Split
 from hwp_bench.evaluation.ablate.design import Design, Variant
 from hwp_bench.evaluation.capture_evaluation import evaluation_job
@@ -26,7 +26,7 @@ from hwp_bench.evaluation.results_folder import (
     say_kept,
 )
 from hwp_bench.methods.manifest import MethodManifest
-from hwp_bench.metrics.lpips_weights import load_available
+from hwp_bench.metrics.lpips import load_available
 from hwp_bench.results import CaptureResult, Results, write_results
 from hwp_bench.run.engine import Engine, LocalEngine, Needs
 

@@ -17,8 +17,8 @@ from hwp_bench.evaluation.budget.frames import pairs_of
 from hwp_bench.evaluation.budget.pair import Pair, error_of
 from hwp_bench.evaluation.budget.runs import ALL, GIVEN, BudgetRuns
 from hwp_bench.methods.material import TRUTHS
+from hwp_bench.metrics.pixels import decibels
 from hwp_bench.metrics.protocol import PSNR_CAP
-from hwp_bench.metrics.psnr_ssim import decibels
 from hwp_bench.results import CaptureResult
 
 #: Version of the budget file.

@@ -10,12 +10,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hwp_bench.capture import Capture
-from hwp_bench.capture.schema import TRUE_TEMPLATE
-from hwp_bench.capture.subject_mesh import read_subject_mesh
+from hwp_bench.capture.schema import TRUE_TEMPLATE, read_subject_mesh
 from hwp_bench.evaluation.budget.pair import Pair, error_of
 from hwp_bench.evaluation.budget.surface import MovingSurface
 from hwp_bench.hands import HandTemplate
-from hwp_bench.metrics.psnr_ssim import decibels
+from hwp_bench.metrics.pixels import decibels
 
 #: Name of its row, and what it is.
 NAME = "true colours"

@@ -11,7 +11,7 @@ from hwp_bench.capture import Capture
 from hwp_bench.evaluation.budget.pair import Pair
 from hwp_bench.evaluation.budget.surface import MovingSurface
 from hwp_bench.evaluation.scoring import read_prediction
-from hwp_bench.hands.footprint import HandSurfaces
+from hwp_bench.hands.anchors import HandSurfaces
 from hwp_bench.metrics.pixels import scored_pixels
 from hwp_bench.metrics.protocol import HWP_V1
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from hwp_bench.base.colors import linear_to_srgb, srgb_to_linear
-from hwp_bench.base.harmonics import harmonics
+from hwp_bench.base.colors import harmonics, linear_to_srgb, srgb_to_linear
 from hwp_bench.evaluation.budget.least_squares import least_error, least_squares
 from hwp_bench.evaluation.budget.pair import Pair
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hwp_bench.metrics.psnr_ssim import squared_error
+from hwp_bench.metrics.pixels import squared_error
 
 if TYPE_CHECKING:
     from hwp_bench.evaluation.budget.surface import MovingSurface

@@ -13,7 +13,7 @@ from hwp_bench.evaluation.budget.corrections import CORRECTIONS
 from hwp_bench.evaluation.budget.frames import pairs_of
 from hwp_bench.evaluation.budget.pair import Pair, error_of
 from hwp_bench.evaluation.budget.runs import GIVEN, BudgetRuns
-from hwp_bench.metrics.psnr_ssim import decibels
+from hwp_bench.metrics.pixels import decibels
 
 # Larger side of a tile, px, and pixels around the hand.
 _EDGE, _MARGIN = 176, 4

@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from scipy.ndimage import distance_transform_edt
 
-from hwp_bench.hands.parameters import Camera, HandPose
+from hwp_bench.hands.articulation import axis_angle_to_matrix, matrix_to_axis_angle
 from hwp_bench.hands.raster import draw_faces, mix_corners
-from hwp_bench.hands.rotations import axis_angle_to_matrix, matrix_to_axis_angle
+from hwp_bench.hands.skeleton import JOINT_COUNT, Camera, HandPose
 from hwp_bench.hands.skinning import pose_hand, project
-from hwp_bench.hands.template import JOINT_COUNT, HandTemplate, TemplateTensors
+from hwp_bench.hands.template import HandTemplate, TemplateTensors
 
 # Numbers of each hand: the turn of every joint, then the translation.
 _TURNS = 3 * JOINT_COUNT

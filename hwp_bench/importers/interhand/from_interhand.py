@@ -15,10 +15,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from hwp_bench.base.errors import BadInput, UsageError
+from hwp_bench.base.console import notice
+from hwp_bench.base.errors import BadInput, UsageError, bounded
 from hwp_bench.base.images import is_blank, read_rgb
-from hwp_bench.base.progress import notice
-from hwp_bench.base.text import bounded
 from hwp_bench.capture import Cameras, CaptureInfo, identify_hand_model
 from hwp_bench.capture.convert import with_one_shape
 from hwp_bench.hands import HandParameters, HandTemplate, load_template, pose_hand

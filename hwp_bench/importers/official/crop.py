@@ -21,9 +21,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hwp_bench.base.console import progress
 from hwp_bench.base.errors import BadInput
 from hwp_bench.base.images import read_gray, read_rgb
-from hwp_bench.base.progress import progress
 from hwp_bench.importers.official.release_records import OfficialRecords
 from hwp_bench.importers.shared.windows import cut, resample
 

@@ -10,10 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from hwp_bench.base.errors import UsageError
+from hwp_bench.base.errors import UsageError, bounded
 from hwp_bench.base.files import sha256_file
 from hwp_bench.base.images import is_blank
-from hwp_bench.base.text import bounded
 from hwp_bench.capture import Cameras, CaptureInfo, identify_hand_model
 from hwp_bench.capture.schema import check_id
 from hwp_bench.hands import load_template

@@ -17,7 +17,7 @@ import torch
 from hwp_bench.base.errors import BadInput
 from hwp_bench.hands import HandParameters, HandTemplate, load_template, pose_hand
 from hwp_bench.hands.fitting import FitTargets, FittingSettings, fit_hand
-from hwp_bench.hands.mano import FINGERTIPS
+from hwp_bench.hands.sources import FINGERTIPS
 from hwp_bench.importers.official.release_records import OfficialRecords, SideRecords
 
 #: Stored vertices that MANO misses by more than this (median frame, mm) mean that the file does

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from hwp_bench.base.arrays import evenly
 from hwp_bench.base.drawing import labelled, outlined, sheet
-from hwp_bench.base.evenly import evenly
 from hwp_bench.capture import Cameras
 from hwp_bench.hands import HandParameters, HandTemplate, pose_hand, project
 from hwp_bench.importers.shared.landmarks import LANDMARK_EDGES

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from hwp_bench.base.console import progress
 from hwp_bench.base.files import refuse_existing as refuse_folder
-from hwp_bench.base.progress import progress
 from hwp_bench.capture import Cameras, CaptureInfo, CaptureWriter
-from hwp_bench.hands.parameters import HandParameters
+from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.importers.shared.frames_parallel import each_frame
 
 #: Name of the overlay sheet among the capture's extra files.

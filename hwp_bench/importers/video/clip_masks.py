@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from hwp_bench.hands.raster import draw_silhouette, overlap
-from hwp_bench.hands.topology import boundary_vertices
+from hwp_bench.hands.template import boundary_vertices
 from hwp_bench.importers.shared.windows import CropWindows, resample
 from hwp_bench.importers.video.clip_model import ClipModel, posed_vertices
 from hwp_bench.importers.video.contour import signed_distance

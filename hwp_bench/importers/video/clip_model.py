@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from hwp_bench.hands import HandParameters, HandTemplate, pose_hand
-from hwp_bench.hands.rotations import axis_angle_to_matrix
+from hwp_bench.hands.articulation import axis_angle_to_matrix
 from hwp_bench.hands.skinning import only_fingertips
 from hwp_bench.importers.video.rigid_start import RigidStart
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from hwp_bench.hands.raster import draw_silhouette
-from hwp_bench.hands.topology import boundary_vertices
+from hwp_bench.hands.template import boundary_vertices
 from hwp_bench.importers.shared.frames_parallel import each_frame
 from hwp_bench.importers.shared.windows import CropWindows
 from hwp_bench.importers.video.clip_model import ClipModel, PosedClip, posed_vertices

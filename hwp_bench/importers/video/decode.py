@@ -13,11 +13,10 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from hwp_bench.base.errors import BadInput, MissingDependency, UsageError
+from hwp_bench.base.console import notice
+from hwp_bench.base.errors import BadInput, MissingDependency, UsageError, bounded, check_name
 from hwp_bench.base.files import check_is_file
 from hwp_bench.base.images import MAX_PIXELS, read_gray
-from hwp_bench.base.progress import notice
-from hwp_bench.base.text import bounded, check_name
 from hwp_bench.importers.shared.windows import CropWindows, cut, resample
 from hwp_bench.importers.video.contour import FIELD_SIZE
 from hwp_bench.importers.video.video_colours import Colours, colours_of, to_srgb

@@ -11,11 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from hwp_bench.base.errors import BadInput, UsageError
+from hwp_bench.base.console import notice, progress
+from hwp_bench.base.errors import BadInput, UsageError, bounded
 from hwp_bench.base.files import atomic_write, read_json, sha256_file, sha256_json
 from hwp_bench.base.images import is_blank
-from hwp_bench.base.progress import notice, progress
-from hwp_bench.base.text import bounded
 from hwp_bench.capture.schema import EXTRA, METADATA, check_id
 from hwp_bench.hands import load_template
 from hwp_bench.importers.shared.landmarks import Landmarks

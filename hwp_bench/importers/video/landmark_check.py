@@ -13,8 +13,8 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from hwp_bench.base.arrays import evenly
 from hwp_bench.base.errors import BadInput
-from hwp_bench.base.evenly import evenly
 from hwp_bench.importers.shared.hand_tracks import read_hand_tracks
 from hwp_bench.importers.shared.landmarks import LANDMARK_EDGES, Landmarks
 from hwp_bench.importers.video.decode import read_frames

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hwp_bench.base.harmonics import COUNT, harmonics
+from hwp_bench.base.colors import COUNT, harmonics
 from hwp_bench.hands import HandTemplate
 from hwp_bench.importers.shared.row_products import row_products
 from hwp_bench.importers.video.atlas import Atlas, sample

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from hwp_bench.base.evenly import evenly
-from hwp_bench.base.progress import notice
+from hwp_bench.base.arrays import evenly
+from hwp_bench.base.console import notice
 from hwp_bench.hands import load_template, pose_hand
 from hwp_bench.importers.shared.hand_tracks import SIDES
 from hwp_bench.importers.shared.landmarks import Landmarks

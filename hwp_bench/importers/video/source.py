@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from hwp_bench.base.console import notice, progress
 from hwp_bench.base.errors import BadInput, UsageError
-from hwp_bench.base.progress import notice, progress
 from hwp_bench.capture.schema import MAX_FRAMES
 from hwp_bench.importers.shared.association import read_association, tracked_sides, tracked_votes
 from hwp_bench.importers.shared.landmarks import Landmarks, check_against_video, read_landmarks

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from hwp_bench.hands.rotations import cross_matrix, right_jacobian
+from hwp_bench.hands.articulation import cross_matrix, right_jacobian
 from hwp_bench.hands.skeleton import moved_joints
 from hwp_bench.importers.video.clip_model import ANCHOR_UNIT, ClipModel, ClipVariables
 

@@ -9,9 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hwp_bench.base.errors import UsageError
+from hwp_bench.base.errors import UsageError, has_odd_characters
 from hwp_bench.base.records import MAX_TEXT
-from hwp_bench.base.text import has_odd_characters
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from hwp_bench.base.arrays import evenly
 from hwp_bench.base.drawing import fitted, labelled, sheet
 from hwp_bench.base.errors import HwpError
-from hwp_bench.base.evenly import evenly
 from hwp_bench.base.images import read_rgb
 from hwp_bench.report.sources import ResultsSource
 

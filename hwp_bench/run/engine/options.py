@@ -73,12 +73,12 @@ def engine_for(args: argparse.Namespace) -> Engine:
         from hwp_bench.run.engine.ray_connect import import_ray
 
         import_ray()
-        from hwp_bench.base.progress import JobsView
+        from hwp_bench.base.console import JobsView
         from hwp_bench.run.engine.ray_engine import RayEngine
 
         return RayEngine(address or None, JobsView())
     if args.jobs > 1:
-        from hwp_bench.base.progress import JobsView
+        from hwp_bench.base.console import JobsView
         from hwp_bench.run.engine.parallel import ParallelEngine
 
         return ParallelEngine(args.jobs, JobsView())

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+from hwp_bench.base.console import JobsView
 from hwp_bench.base.errors import HwpError, UsageError
-from hwp_bench.base.progress import JobsView
 from hwp_bench.run.engine.job import RETRIES, Failures, Job, Needs, OnDone, OnStart, lost
 from hwp_bench.run.engine.process import (
     VISIBLE_GPUS,

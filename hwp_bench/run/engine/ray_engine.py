@@ -6,8 +6,8 @@ import contextlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from hwp_bench.base.console import JobsView
 from hwp_bench.base.errors import HwpError
-from hwp_bench.base.progress import JobsView
 from hwp_bench.run.engine.job import (
     RETRIES,
     Failures,

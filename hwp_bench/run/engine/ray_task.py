@@ -11,9 +11,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from hwp_bench.base.denormals import flushed
 from hwp_bench.base.errors import BadInput, HwpError
 from hwp_bench.base.files import cache_root, files_digest
+from hwp_bench.base.numerics import flushed
 from hwp_bench.base.packages import PACKAGES
 from hwp_bench.run.engine.job import RETRIES, Work
 from hwp_bench.run.engine.parcel import Parcel, folder_digest, pack, unpack

@@ -11,8 +11,8 @@ from pathlib import Path
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import cache_root
+from hwp_bench.base.numerics import OPENCV_WAITING, OPENMP_WAITING, TORCH_COUNTS
 from hwp_bench.base.packages import PACKAGES, data_folder
-from hwp_bench.base.threads import OPENCV_WAITING, OPENMP_WAITING, TORCH_COUNTS
 from hwp_bench.run.sandbox.memory import SCRATCH, SCRATCH_BYTES, default_limit, scratch_bytes
 from hwp_bench.run.sandbox.pythons import checkout, of_packages, python_places
 from hwp_bench.run.sandbox.root import Place
@@ -71,7 +71,7 @@ _NEVER_FROM = ("/proc", "/sys")
 _MOST_LINKS = 40
 #: Folders inside the output of a run: its cache, and its home inside the walls.
 CACHE, HOME = "cache", "home"
-#: As `hwp_bench.base.machine_code.KEPT`, which needs numba.
+#: As `hwp_bench.base.kernels.KEPT`, which needs numba.
 KEPT_KERNELS = "HWP_KEPT_KERNELS"
 
 

@@ -16,10 +16,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
-from hwp_bench.base.errors import MethodFailed
+from hwp_bench.base.errors import MethodFailed, shown
+from hwp_bench.base.folders import open_up
 from hwp_bench.base.packages import PACKAGES
-from hwp_bench.base.text import shown
-from hwp_bench.base.trees import open_up
 from hwp_bench.run.sandbox import memory
 from hwp_bench.run.sandbox.memory import ControlGroup, Measure
 from hwp_bench.run.sandbox.root import Place

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from hwp_bench.base.ray_mesh import ray_mesh
+from hwp_bench.base.rays import ray_mesh
 
 #: Distance by which secondary rays leave their surface, m; below it a hand shades itself.
 LIFT = 4e-4

@@ -18,9 +18,9 @@ from types import MappingProxyType
 import numpy as np
 
 from hwp_bench.base.colors import linear_to_srgb
+from hwp_bench.base.console import track
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.files import atomic_write
-from hwp_bench.base.progress import track
 from hwp_bench.sim.effects.base import registered
 from hwp_bench.sim.effects.plan import hands_at, plan
 from hwp_bench.sim.geometry.noise import generator

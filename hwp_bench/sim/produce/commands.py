@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 def list_scenes(args: argparse.Namespace) -> int:
     """Print the scenes, and what scenes can be made of."""
-    from hwp_bench.hands.gestures import gestures
+    from hwp_bench.hands.poses import gestures
     from hwp_bench.sim.effects.base import ORDER
     from hwp_bench.sim.produce.suites import suite, suite_names
     from hwp_bench.sim.props.backdrop import backdrop_names

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hwp_bench.hands.parameters import HandParameters
+from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.sim.effects.base import registered
 from hwp_bench.sim.effects.plan import FramePlan
 from hwp_bench.sim.geometry.noise import generator

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from hwp_bench.base.arguments import whole_number
-from hwp_bench.base.errors import UsageError
+from hwp_bench.base.errors import UsageError, whole_number
 
 #: Smallest and largest number of frames.
 FRAMES = (10, 100_000)

@@ -14,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
+from hwp_bench.base.console import progress
 from hwp_bench.base.errors import HwpError
-from hwp_bench.base.nearest import kd_tree
-from hwp_bench.base.progress import progress
+from hwp_bench.base.numerics import kd_tree
 from hwp_bench.capture import Cameras, Capture, CaptureInfo, CaptureWriter, open_capture
 from hwp_bench.capture.schema import FREE_VIEW, MAX_ID
-from hwp_bench.hands.parameters import HandParameters
+from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.sim.geometry.mesh import unit
 from hwp_bench.sim.geometry.raycast import RenderCost
 from hwp_bench.sim.produce.frames import eight_bit_coverage

@@ -13,11 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from hwp_bench.base.arguments import place, whole_number
-from hwp_bench.base.errors import HwpError, UsageError, reason_of
+from hwp_bench.base.console import progress
+from hwp_bench.base.errors import HwpError, UsageError, place, reason_of, whole_number
 from hwp_bench.base.files import canonical_json, sha256_json
-from hwp_bench.base.locks import exclusive
-from hwp_bench.base.progress import progress
+from hwp_bench.base.folders import exclusive
 from hwp_bench.capture import (
     Cameras,
     Capture,
@@ -27,7 +26,7 @@ from hwp_bench.capture import (
     open_capture,
 )
 from hwp_bench.capture.schema import FREE_VIEW, SIMULATED
-from hwp_bench.hands.parameters import HandParameters
+from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.sim.effects.plan import FramePlan, hands_at, plan
 from hwp_bench.sim.produce.estimates import estimate_hands, estimate_mask
 from hwp_bench.sim.produce.extent import check_extent

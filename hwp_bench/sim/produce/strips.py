@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
+from hwp_bench.base.arrays import evenly
+from hwp_bench.base.console import track
 from hwp_bench.base.errors import UsageError
-from hwp_bench.base.evenly import evenly
 from hwp_bench.base.files import atomic_write
 from hwp_bench.base.images import write_image
-from hwp_bench.base.progress import track
 from hwp_bench.sim.effects.base import registered
 from hwp_bench.sim.effects.plan import hands_at
 from hwp_bench.sim.geometry.noise import generator

@@ -11,8 +11,7 @@ from hwp_bench.base.errors import BadInput, HwpError
 from hwp_bench.base.files import read_json, sha256_json
 from hwp_bench.base.records import parse_record
 from hwp_bench.capture import Capture
-from hwp_bench.capture.schema import EXTRA, SIMULATED, TRUE_TEMPLATE
-from hwp_bench.capture.subject_mesh import write_subject_mesh
+from hwp_bench.capture.schema import EXTRA, SIMULATED, TRUE_TEMPLATE, write_subject_mesh
 from hwp_bench.hands.template import HandTemplate, rebuilt
 from hwp_bench.sim.geometry.mesh import surface_normals
 from hwp_bench.sim.scene.motion import palm_of

@@ -11,7 +11,7 @@ from types import MappingProxyType
 
 from hwp_bench.base.errors import HwpError, UsageError
 from hwp_bench.base.files import cache_root
-from hwp_bench.base.locks import exclusive
+from hwp_bench.base.folders import exclusive
 from hwp_bench.run.engine import Engine, Job, LocalEngine, Needs
 from hwp_bench.run.engine.job import OnProgress
 from hwp_bench.sim.scene.reader import load_scene, scene_groups, scene_names

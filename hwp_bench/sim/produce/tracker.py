@@ -12,8 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hwp_bench.hands.parameters import HandParameters
-from hwp_bench.hands.posed_skeleton import (
+from hwp_bench.hands.poses import (
     DEGREES,
     PosedSkeleton,
     RestSkeleton,
@@ -23,6 +22,7 @@ from hwp_bench.hands.posed_skeleton import (
     rest_skeleton,
     turned,
 )
+from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.sim.geometry.noise import generator
 from hwp_bench.sim.produce.tracker_geometry import curl, edge_on
 from hwp_bench.sim.produce.tracker_noise import (

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from hwp_bench.base.errors import HwpError
-from hwp_bench.base.movies import yuv_planes
+from hwp_bench.base.images import yuv_planes
 
 #: Encoder in FFmpeg's naming, its preset, and the frames from one that stands alone to the next.
 ENCODER, PRESET, KEYFRAME_EVERY = "libx264", "veryfast", 30

@@ -6,8 +6,7 @@ import math
 
 import numpy as np
 
-from hwp_bench.base.compiled import helper
-from hwp_bench.base.vectors import dot
+from hwp_bench.base.kernels import dot, helper
 
 _ONE, _LEAST_ROUGH, _MOST_GLOSS = np.float32(1.0), np.float32(0.05), np.float32(0.8)
 

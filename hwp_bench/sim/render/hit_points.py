@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hwp_bench.base.compiled import compiled, helper
+from hwp_bench.base.kernels import compiled, helper
 
 
 @compiled(nogil=True)

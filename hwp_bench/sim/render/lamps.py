@@ -10,8 +10,7 @@ import math
 
 import numpy as np
 
-from hwp_bench.base.compiled import compiled
-from hwp_bench.base.vectors import dot
+from hwp_bench.base.kernels import compiled, dot
 from hwp_bench.sim.geometry.raycast import LIFT, Tracer
 from hwp_bench.sim.render.gloss import gloss_lobe, grazing
 from hwp_bench.sim.render.samples import Samples

@@ -6,8 +6,7 @@ import math
 
 import numpy as np
 
-from hwp_bench.base.compiled import compiled
-from hwp_bench.base.vectors import dot
+from hwp_bench.base.kernels import compiled, dot
 from hwp_bench.sim.render.gloss import gloss_lobe
 
 _ONE = np.float32(1.0)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from hwp_bench.hands.gestures import gestures, within_limits
+from hwp_bench.hands.poses import gestures, within_limits
 from hwp_bench.sim.geometry.mesh import unit
 from hwp_bench.sim.geometry.noise import generator
 from hwp_bench.sim.scene.motion import HandMoment, heading_matrix, track_moment

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hwp_bench.hands.gestures import finger_pose, gesture, mirrored, within_limits
+from hwp_bench.hands.poses import finger_pose, gesture, mirrored, within_limits
 from hwp_bench.sim.geometry.noise import generator
 from hwp_bench.sim.scene.schema import HandKey, Scene
 

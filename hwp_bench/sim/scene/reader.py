@@ -11,8 +11,7 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta
 
 from hwp_bench.base.errors import BadInput, UsageError
-from hwp_bench.base.records import Seed, number, parse_record
-from hwp_bench.base.toml_text import MAX_CHARACTERS, parse_toml
+from hwp_bench.base.records import MAX_CHARACTERS, Seed, number, parse_record, parse_toml
 from hwp_bench.sim.props.backdrop import check_backdrop
 from hwp_bench.sim.scene.behind import NOTHING, Behind
 from hwp_bench.sim.scene.effect_settings import check_settings, keys_by_side

@@ -13,11 +13,10 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
-from hwp_bench.base.errors import UsageError
+from hwp_bench.base.errors import ODD_CHARACTERS, UsageError
 from hwp_bench.base.files import sha256_json
 from hwp_bench.base.records import Seed, number
-from hwp_bench.base.text import ODD_CHARACTERS
-from hwp_bench.hands.gestures import gesture
+from hwp_bench.hands.poses import gesture
 from hwp_bench.sim.geometry.noise import generator
 from hwp_bench.sim.scene.behind import NOTHING, Behind
 from hwp_bench.sim.scene.lighting import Lamp, Room

@@ -11,7 +11,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from hwp_bench.hands.gestures import FINGERS, FIRST_JOINT, finger_back
+from hwp_bench.hands.poses import FIRST_JOINT, finger_back
+from hwp_bench.hands.skeleton import FINGERS
 from hwp_bench.sim.geometry.mesh import unit
 from hwp_bench.sim.geometry.noise import fractal_noise
 

@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hwp_bench.hands.skeleton import PARENTS
-from hwp_bench.hands.template import SHAPE_COUNT
+from hwp_bench.hands.skeleton import PARENTS, SHAPE_COUNT
 
 if TYPE_CHECKING:
     from hwp_bench.hands import HandTemplate

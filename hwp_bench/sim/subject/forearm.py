@@ -11,7 +11,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from hwp_bench.hands.topology import boundary_loop
+from hwp_bench.hands.template import boundary_loop
 from hwp_bench.sim.geometry.mesh import unit
 from hwp_bench.sim.geometry.surface import Material, Surface
 from hwp_bench.sim.scene.schema import Subject

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from hwp_bench.base.colors import srgb_to_linear
-from hwp_bench.hands.gestures import FINGERS, FIRST_JOINT
+from hwp_bench.hands.poses import FIRST_JOINT
+from hwp_bench.hands.skeleton import FINGERS
 from hwp_bench.sim.geometry.mesh import unit
 from hwp_bench.sim.geometry.noise import fractal_noise, generator
 from hwp_bench.sim.scene.looks import Glove

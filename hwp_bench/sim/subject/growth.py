@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hwp_bench.hands.gestures import FINGERS, FIRST_JOINT
+from hwp_bench.hands.poses import FIRST_JOINT
+from hwp_bench.hands.skeleton import FINGERS
 from hwp_bench.sim.geometry.mesh import unit
 from hwp_bench.sim.scene.subject_anatomy import SubjectAnatomy
 from hwp_bench.sim.subject.anatomy import Anatomy

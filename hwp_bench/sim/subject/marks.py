@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hwp_bench.base.nearest import kd_tree
+from hwp_bench.base.numerics import kd_tree
 from hwp_bench.sim.geometry.mesh import unit
 from hwp_bench.sim.geometry.noise import fractal_noise
 

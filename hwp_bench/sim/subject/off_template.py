@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 from hwp_bench.hands import HandTemplate, mirror_template
-from hwp_bench.hands.gestures import FINGERS, FIRST_JOINT
-from hwp_bench.hands.skeleton import PARENTS
-from hwp_bench.hands.template import JOINT_COUNT, rebuilt
+from hwp_bench.hands.poses import FIRST_JOINT
+from hwp_bench.hands.skeleton import FINGERS, JOINT_COUNT, PARENTS
+from hwp_bench.hands.template import rebuilt
 from hwp_bench.sim.geometry.mesh import smoothing_step, unit
 from hwp_bench.sim.geometry.noise import generator
 from hwp_bench.sim.scene.subject_anatomy import SubjectAnatomy

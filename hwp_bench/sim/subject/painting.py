@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from hwp_bench.base.colors import srgb_to_linear
-from hwp_bench.hands.gestures import FINGERS, FIRST_JOINT
+from hwp_bench.hands.poses import FIRST_JOINT
+from hwp_bench.hands.skeleton import FINGERS
 from hwp_bench.sim.geometry.noise import generator
 from hwp_bench.sim.scene.looks import PLAIN, Polish
 from hwp_bench.sim.scene.schema import Subject

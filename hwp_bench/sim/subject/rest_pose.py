@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hwp_bench.hands.skeleton import PARENTS
-from hwp_bench.hands.template import JOINT_COUNT
+from hwp_bench.hands.skeleton import JOINT_COUNT, PARENTS
 
 # The last bone ends in skin, not in a joint; smaller differences of its direction are not sure.
 _UNSURE = np.radians(6.0)

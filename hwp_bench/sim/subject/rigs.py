@@ -13,7 +13,8 @@ import numpy as np
 
 from hwp_bench.base.errors import BadHandModel, UsageError
 from hwp_bench.hands import HandTemplate, mirror_template
-from hwp_bench.hands.template import JOINT_COUNT, SHAPE_COUNT, make_template
+from hwp_bench.hands.skeleton import JOINT_COUNT, SHAPE_COUNT
+from hwp_bench.hands.template import make_template
 from hwp_bench.sim.subject.joint_names import hand_joints, is_elsewhere, side_of_name
 from hwp_bench.sim.subject.rest_pose import into_rest_pose
 from hwp_bench.sim.subject.rig_mesh import RigMesh, kept

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hwp_bench.base.colors import srgb_to_linear
-from hwp_bench.hands.topology import boundary_loop
+from hwp_bench.hands.template import boundary_loop
 from hwp_bench.sim.geometry.mesh import unit
 from hwp_bench.sim.geometry.noise import fractal_noise, generator
 from hwp_bench.sim.geometry.surface import Material, Surface

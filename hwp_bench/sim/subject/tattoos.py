@@ -6,7 +6,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from hwp_bench.hands.gestures import FINGERS, FIRST_JOINT, finger_back
+from hwp_bench.hands.poses import FIRST_JOINT, finger_back
+from hwp_bench.hands.skeleton import FINGERS
 from hwp_bench.sim.geometry.mesh import unit
 from hwp_bench.sim.geometry.noise import generator
 from hwp_bench.sim.scene.looks import Tattoo

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from hwp_bench.base.colors import srgb_to_linear
-from hwp_bench.hands.gestures import FIRST_JOINT, finger_back
+from hwp_bench.hands.poses import FIRST_JOINT, finger_back
 from hwp_bench.sim.geometry.mesh import surface_normals, unit
 from hwp_bench.sim.geometry.surface import Surface, join, plain, transformed
 from hwp_bench.sim.props.jewellery import angles, band, beads, metal, stone

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from hwp_bench.base.errors import BadHandModel
-from hwp_bench.base.nearest import kd_tree
+from hwp_bench.base.numerics import kd_tree
 from hwp_bench.sim.subject.rig_mesh import RigMesh, closed, components, cut, kept, outlines
 
 #: How far behind the wrist's joint a mesh is cut, m; the free hand's own rim lies there.

@@ -11,7 +11,7 @@ import pytest
 from hwp_bench.analysis.novelty import measure_novelty
 from hwp_bench.capture import Capture
 from hwp_bench.capture.splits import contiguous_split
-from hwp_bench.hands.rotations import axis_angle_to_matrix
+from hwp_bench.hands.articulation import axis_angle_to_matrix
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from hwp_bench.base.caches import read_private, trim, write_private
+from hwp_bench.base.folders import read_private, trim, write_private
 
 
 def test_what_was_used_longest_ago_goes_first(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 from numba.core import event
 from numba.core.errors import TypingError
 
-from hwp_bench.base.compiled import compiled
+from hwp_bench.base.kernels import compiled
 
 
 @pytest.fixture(autouse=True)

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hwp_bench.base.evenly import evenly
+from hwp_bench.base.arrays import evenly
 
 
 @given(count=st.integers(0, 3000), most=st.integers(0, 500))

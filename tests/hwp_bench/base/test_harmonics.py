@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hwp_bench.base.harmonics import COUNT, harmonics
+from hwp_bench.base.colors import COUNT, harmonics
 
 
 def test_pixels_without_a_normal_get_the_constant_alone() -> None:

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from hwp_bench.base import kernel_sources
-from hwp_bench.base.kernel_sources import kernel_digest, kernel_modules
+from hwp_bench.base import kernels as kernel_sources
+from hwp_bench.base.kernels import kernel_digest, kernel_modules
 
 
 @pytest.fixture
@@ -15,9 +15,9 @@ def root(tmp_path: Path) -> Path:
     texts = {
         "hwp_bench/__init__.py": "import hwp_bench.unrelated",
         "hwp_bench/unrelated.py": "",
-        "hwp_bench/base/compiled.py": "import hwp_bench.unrelated",
+        "hwp_bench/base/kernels.py": "import hwp_bench.unrelated",
         "hwp_bench/room/__init__.py": "from hwp_bench.unrelated import x",
-        "hwp_bench/room/kernels.py": "import numpy\nfrom hwp_bench.base.compiled import compiled\n"
+        "hwp_bench/room/kernels.py": "import numpy\nfrom hwp_bench.base.kernels import compiled\n"
         "from hwp_bench.room import constants as at\nfrom hwp_bench.room.helpers import f",
         "hwp_bench/room/constants.py": "",
         "hwp_bench/room/helpers.py": "def f():\n    from .deep import g",

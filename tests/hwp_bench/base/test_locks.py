@@ -14,14 +14,14 @@ from small_captures import CaptureMaker
 from toy_method import write_toy_method
 
 from hwp_bench.base.errors import HwpError
-from hwp_bench.base.locks import exclusive
+from hwp_bench.base.folders import exclusive
 from hwp_bench.cli.main import main
 from hwp_bench.results import read_results
 
 ROOT = Path(__file__).parents[2]
 HOLD = """
 import sys, time
-from hwp_bench.base.locks import exclusive
+from hwp_bench.base.folders import exclusive
 with exclusive(sys.argv[1]):
     print("held", flush=True)
     time.sleep(600)

@@ -18,7 +18,7 @@ import pytest
 from hwp_bench.base.packages import PACKAGES
 
 _KERNELS = """
-from hwp_bench.base.compiled import compiled
+from hwp_bench.base.kernels import compiled
 from hwp_bench.room.constants import FACTOR
 
 @compiled(nogil=True)

@@ -10,7 +10,7 @@ import pytest
 from browser import open_page
 
 from hwp_bench.base.errors import HwpError, MissingDependency, ShapeMismatch
-from hwp_bench.base.movies import check_encoder, write_movie
+from hwp_bench.base.images import check_encoder, write_movie
 
 FPS = 24
 #: Flat colours of a hand, a wall and a sleeve, sRGB.

@@ -7,14 +7,13 @@ import sys
 import numpy as np
 
 from benchmarks.patience import run
-from hwp_bench.base.denormals import flushed, flushes
-from hwp_bench.base.nearest import kd_tree
+from hwp_bench.base.numerics import flushed, flushes, kd_tree
 
 # In a process of its own: a build that does not end kills it.
 FLAT = """
 import numpy as np
-from hwp_bench.base.denormals import flushed
-from hwp_bench.base.nearest import kd_tree
+from hwp_bench.base.numerics import flushed
+from hwp_bench.base.numerics import kd_tree
 points = np.zeros((45, 3))
 points[40:] = np.random.default_rng(0).random((5, 3))
 with flushed():

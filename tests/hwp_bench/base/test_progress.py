@@ -7,13 +7,13 @@ import sys
 import pytest
 from stopped_clock import Clock, stop_clock
 
-from hwp_bench.base.progress import JobsView, progress, track
+from hwp_bench.base.console import JobsView, progress, track
 
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     """The clock that progress looks at."""
-    return stop_clock(monkeypatch, "hwp_bench.base.progress")
+    return stop_clock(monkeypatch, "hwp_bench.base.console")
 
 
 @pytest.mark.parametrize(

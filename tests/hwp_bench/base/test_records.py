@@ -13,8 +13,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from msgspec import Meta
 
-from hwp_bench.base.denormals import flushed, flushes
 from hwp_bench.base.errors import BadInput, BadMethod, BadResult, UsageError
+from hwp_bench.base.numerics import flushed, flushes
 from hwp_bench.base.records import (
     Line,
     Text,

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from hwp_bench.base.scratch import UNLOCKED_SECONDS, remove_left, scratch_folder
+from hwp_bench.base.folders import UNLOCKED_SECONDS, remove_left, scratch_folder
 
 HOLDER = """
 import sys, time
-from hwp_bench.base.scratch import scratch_folder
+from hwp_bench.base.folders import scratch_folder
 with scratch_folder("hwp-test-") as folder:
     (folder / "frame.png").write_bytes(b"pixels")
     print(folder, flush=True)

@@ -7,13 +7,12 @@ import sys
 import pytest
 from stopped_clock import Clock, stop_clock
 
-from hwp_bench.base.progress import OUTER, progress
-from hwp_bench.base.stages_view import StagesView
+from hwp_bench.base.console import OUTER, StagesView, progress
 
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    return stop_clock(monkeypatch, "hwp_bench.base.progress", "hwp_bench.base.stages_view")
+    return stop_clock(monkeypatch, "hwp_bench.base.console", "hwp_bench.base.console")
 
 
 def test_off_a_terminal_each_stage_is_a_line(clock: Clock, capsys) -> None:

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hwp_bench.base.tables import Column, Table, print_table
-from hwp_bench.base.terminal_tables import table_lines
+from hwp_bench.base.tables import Column, Table, draw_table, print_table
+
+
+def lines_of(table: Table, width: int, *, styled: bool = True) -> list[str]:
+    """The lines of a table without the codes of a terminal."""
+    drawn = draw_table(table, width, styled=styled)
+    return re.sub(r"\x1b\[[0-9;]*m", "", drawn).splitlines()
+
 
 WORDS = st.text("abcdefgh", min_size=1, max_size=9)
 TITLES = st.lists(WORDS, min_size=1, max_size=4).map(" ".join)
@@ -34,8 +41,8 @@ def tables(draw) -> Table:
 
 @settings(max_examples=150, deadline=None)
 @given(tables(), st.integers(60, 200), st.booleans())
-def test_no_number_is_cut_and_no_line_is_too_long(table: Table, width: int, marks: bool) -> None:
-    lines = [line.text for line in table_lines(table, width, marks=marks)]
+def test_no_number_is_cut_and_no_line_is_too_long(table: Table, width: int, styled: bool) -> None:
+    lines = lines_of(table, width, styled=styled)
     assert max(map(len, lines)) <= width
     words = [word.rstrip("*") for line in lines for word in line.split()]
     for row in range(len(table.rows)):
@@ -69,7 +76,7 @@ TABLE = Table(
 
 
 def test_columns_that_do_not_fit_follow_in_a_block_of_their_own() -> None:
-    lines = [line.text for line in table_lines(TABLE, 80)]
+    lines = lines_of(TABLE, 80)
     assert lines[0] == "All captures"
     assert lines[1].replace("─", "").split() == ["Single", "Interacting"]
     first, second = (index for index, line in enumerate(lines) if line.startswith("Plain fit"))
@@ -87,7 +94,7 @@ def test_columns_that_do_not_fit_follow_in_a_block_of_their_own() -> None:
     # Numbers of a column stand under each other: its digits end where its heading ends.
     assert len(lines[first]) == len(lines[first + 1])
     # A wide terminal shows everything side by side.
-    wide = [line.text for line in table_lines(TABLE, 120)]
+    wide = lines_of(TABLE, 120)
     assert sum(line.startswith("Plain fit") for line in wide) == 1
 
 
@@ -99,9 +106,9 @@ def test_best_values_are_marked_where_nothing_can_be_bold(capsys, monkeypatch) -
     assert "27.35*" in out
     assert "23.67 " in out
     assert "* the best of the rows on the same data." in out
-    styled = [piece for line in table_lines(TABLE, 80) for piece in line.pieces]
-    assert ("27.35", "bold") in styled
-    assert ("23.67", "underline") in styled
+    styled = draw_table(TABLE, 80, styled=True)
+    assert "\x1b[1m27.35\x1b" in styled
+    assert "\x1b[4m23.67\x1b" in styled
     print_table(replace(TABLE, ranked=False))
     assert "*" not in capsys.readouterr().out
 
@@ -113,7 +120,7 @@ def test_long_texts_are_folded_and_lines_separate_blocks() -> None:
         (("a" * 40, 1.0, "word " * 30), ("b", 2.0, "x")),
         breaks=(1,),
     )
-    lines = [line.text for line in table_lines(table, 80)]
+    lines = lines_of(table, 80)
     assert max(map(len, lines)) <= 80
     assert sum(line.count("word") for line in lines) == 30
     assert "".join(lines).count("a" * 12) >= 3
@@ -130,7 +137,7 @@ def test_a_block_says_once_what_its_rows_share(
     )
     columns = (Column("Block"), Column("Row"), Column("Value", 2, True))
     table = Table("T", columns, rows, breaks=tuple(range(size, len(rows), size)))
-    words = [word for line in table_lines(table, width) for word in line.text.split()]
+    words = " ".join(lines_of(table, width)).split()
     repeats = range(0, len(rows), size) if table.breaks else range(len(rows))
     assert [word for word in words if word.startswith("block")] == [rows[i][0] for i in repeats]
     assert [word for word in words if word.startswith("row")] == [row[1] for row in rows]
@@ -146,7 +153,7 @@ def test_a_repeated_text_flows_down_over_the_rows_that_repeat_it() -> None:
             (kind, method) for kind in ("near", "far") for method in ("A", "B", "C")
         )
     )
-    printed = [line.text for line in table_lines(Table("T", columns, rows, breaks=(3,)), 30)]
+    printed = lines_of(Table("T", columns, rows, breaks=(3,)), 30)
     assert printed[2:] == [
         "What is new   Class  Method      ↑",
         "──────────────────────────────────",

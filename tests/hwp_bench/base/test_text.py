@@ -8,10 +8,9 @@ from typing import Any
 
 import pytest
 
-from hwp_bench.base.errors import BadResult
-from hwp_bench.base.progress import notice
+from hwp_bench.base.console import notice
+from hwp_bench.base.errors import BadResult, bounded, has_odd_characters, shown
 from hwp_bench.base.records import parse_record
-from hwp_bench.base.text import bounded, has_odd_characters, shown
 
 
 def test_exactly_controls_direction_marks_and_surrogates_are_odd() -> None:

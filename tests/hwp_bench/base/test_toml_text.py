@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hwp_bench.base.errors import BadInput, UsageError
-from hwp_bench.base.toml_text import MAX_CHARACTERS, MAX_DEPTH, parse_toml
+from hwp_bench.base.records import MAX_CHARACTERS, MAX_TOML_DEPTH, parse_toml
 from hwp_bench.cli.overrides import overrides
 from hwp_bench.sim.scene.reader import parse_scene, scene_path
 
@@ -23,7 +23,7 @@ DEEP = "[" * 5000 + "]" * 5000
         ("0x" + "f" * 5000, "absurdly large"),
         (str(2**300), "absurdly large"),
         (DEEP, "nested too deeply"),
-        ("[" * (MAX_DEPTH + 1) + "]" * (MAX_DEPTH + 1), "nested too deeply"),
+        ("[" * (MAX_TOML_DEPTH + 1) + "]" * (MAX_TOML_DEPTH + 1), "nested too deeply"),
         ("{a = " * 400 + "1" + "}" * 400, "nested too deeply"),
         ("'\ud800'", "cannot be Unicode"),
         ("'" + "x" * MAX_CHARACTERS + "'", "more than"),

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from hwp_bench.base.trees import DEEPEST, open_up, remove_tree
+from hwp_bench.base.folders import DEEPEST, open_up, remove_tree
 
 LEVELS = 3000
 

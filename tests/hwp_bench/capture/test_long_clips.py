@@ -16,7 +16,7 @@ from small_captures import CaptureMaker
 
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.check import check_capture
-from hwp_bench.metrics.batch import Frame, score_frames
+from hwp_bench.metrics.score import Frame, score_frames
 
 SIZE, FRAMES = 64, (50, 250)
 PIXELS = SIZE * SIZE * 4

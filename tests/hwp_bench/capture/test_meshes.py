@@ -12,7 +12,7 @@ import trimesh
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.capture import Capture
-from hwp_bench.capture.meshes import FORMATS, hand_meshes, write_meshes
+from hwp_bench.capture.convert import FORMATS, hand_meshes, write_meshes
 from hwp_bench.cli.main import main
 from hwp_bench.hands import pose_hand
 

@@ -9,7 +9,7 @@ import pytest
 
 from hwp_bench.base.arrays import read_npz, write_npz
 from hwp_bench.base.errors import BadInput
-from hwp_bench.capture.subject_mesh import read_subject_mesh, write_subject_mesh
+from hwp_bench.capture.schema import read_subject_mesh, write_subject_mesh
 from hwp_bench.hands import load_template
 from hwp_bench.hands.template import rebuilt
 

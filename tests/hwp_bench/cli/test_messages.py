@@ -21,7 +21,7 @@ from synthetic_mano import mano_content
 from hwp_bench.base.errors import BadInput, HwpError, reason_of
 from hwp_bench.base.files import atomic_write, cache_root
 from hwp_bench.cli.main import main
-from hwp_bench.hands.mano import load_mano
+from hwp_bench.hands.sources import load_mano
 from hwp_bench.results import write_results
 
 

@@ -13,8 +13,8 @@ from small_captures import CaptureMaker
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.images import read_rgb, write_image
 from hwp_bench.capture import open_capture
-from hwp_bench.capture.sheet import draw_hands
-from hwp_bench.capture.tracks import LARGEST
+from hwp_bench.capture.check import draw_hands
+from hwp_bench.capture.schema import LARGEST
 from hwp_bench.cli.main import main
 
 ODD = os.fsdecode(b"a\xff\xfe")

@@ -149,7 +149,7 @@ def test_a_submission_that_is_not_filled_renders_nothing(tmp_path: Path, capsys)
 
 
 def test_a_folder_that_another_run_writes_to_is_said_at_once(tmp_path: Path, capsys) -> None:
-    from hwp_bench.base.locks import exclusive
+    from hwp_bench.base.folders import exclusive
 
     _method(tmp_path / "mine")
     with exclusive(tmp_path / "out"):

@@ -10,7 +10,7 @@ import torch
 import trimesh
 
 from hwp_bench.hands import HandParameters, HandTemplate, pose_hand
-from hwp_bench.hands.footprint import Footprint, HandSurfaces
+from hwp_bench.hands.anchors import Footprint, HandSurfaces
 from hwp_bench.hands.raster import draw_silhouette
 
 SIZE, FRAMES = 96, 3

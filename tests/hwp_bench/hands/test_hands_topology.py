@@ -9,7 +9,7 @@ import trimesh
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.hands import HandTemplate, load_template, pose_hand, subdivide
-from hwp_bench.hands.topology import MAX_TIMES, boundary_vertices, mano_hd, open_loops
+from hwp_bench.hands.template import MAX_TIMES, boundary_vertices, mano_hd, open_loops
 
 
 def boundary_count(faces: np.ndarray) -> int:

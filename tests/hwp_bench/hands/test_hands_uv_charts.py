@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from hwp_bench.hands import HandTemplate, load_template
-from hwp_bench.hands.mano import two_chart_uv
 from hwp_bench.hands.skeleton import palm_directions
+from hwp_bench.hands.sources import two_chart_uv
 
 
 @pytest.mark.parametrize("side", ["right", "left"])

@@ -244,3 +244,15 @@ def test_a_method_without_a_list_takes_any_setting(tmp_path: Path) -> None:
         'schema = "hwp-method/1"\nname = "free"\n[entry]\npython = "a:b"\n'
     )
     read_manifest(tmp_path).check_setting_names({"anything": {"at": "all"}})
+
+
+def test_settings_may_be_a_class(tmp_path: Path) -> None:
+    (tmp_path / "code.py").write_text(
+        "@dataclass\nclass Mine:\n    steps: int = 1\n    rate: float = 1"
+    )
+    _write(tmp_path, GOOD.replace("[entry]", 'settings = "code:Mine"\n[entry]'))
+    assert read_manifest(tmp_path).settings == ("steps", "rate")
+    with pytest.raises(BadMethod, match=r"'rat' is not a setting of mine. Did you mean 'rate'"):
+        read_manifest(tmp_path).check_setting_names({"rat": 2})
+    _write(tmp_path, GOOD.replace("[entry]", 'settings = ["mode", "code:Mine"]\n[entry]'))
+    assert read_manifest(tmp_path).settings == ("mode", "steps", "rate")

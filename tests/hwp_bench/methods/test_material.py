@@ -10,9 +10,8 @@ from small_captures import CaptureMaker
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.capture import Capture
-from hwp_bench.capture.schema import TRUE_TEMPLATE
+from hwp_bench.capture.schema import TRUE_TEMPLATE, write_subject_mesh
 from hwp_bench.capture.splits import contiguous_split
-from hwp_bench.capture.subject_mesh import write_subject_mesh
 from hwp_bench.hands import load_template
 from hwp_bench.methods.material import TRUTHS, frames_with, known_truths, training_material
 

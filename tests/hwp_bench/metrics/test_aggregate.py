@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hwp_bench.base.errors import BadResult
-from hwp_bench.metrics.aggregate import CaptureScores, aggregate, mean_scores
+from hwp_bench.metrics.score import CaptureScores, aggregate, mean_scores
 
 
 def capture(id_, hands, perturbations, scores):

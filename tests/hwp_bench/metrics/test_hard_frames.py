@@ -12,9 +12,8 @@ import pytest
 from skimage.metrics import structural_similarity
 
 from hwp_bench.base.errors import BadImage, HwpError, ShapeMismatch
-from hwp_bench.metrics.batch import Frame, score_frames
 from hwp_bench.metrics.protocol import PSNR_CAP
-from hwp_bench.metrics.score import score_frame
+from hwp_bench.metrics.score import Frame, score_frame, score_frames
 
 
 def textured(shape: tuple[int, int], seed: int) -> np.ndarray:

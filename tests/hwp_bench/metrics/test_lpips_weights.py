@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from hwp_bench.base.errors import BadInput, MissingDependency, UsageError
-from hwp_bench.metrics import lpips_weights
-from hwp_bench.metrics.lpips_weights import (
+from hwp_bench.metrics import lpips as lpips_weights
+from hwp_bench.metrics.lpips import (
     BACKBONE_FILES,
     LINEAR_DIGESTS,
     LpipsFiles,
@@ -153,7 +153,7 @@ def test_an_unknown_network_is_refused():
 
 def test_asking_does_not_import_torch():
     code = (
-        "import sys; from hwp_bench.metrics.lpips_weights import lpips_available;"
+        "import sys; from hwp_bench.metrics.lpips import lpips_available;"
         "lpips_available('alex'); sys.exit('torch' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0

@@ -14,12 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hwp_bench.base.errors import EmptyMask, ShapeMismatch
-from hwp_bench.metrics.oriented_distance import (
-    ORIENTATIONS,
-    filter_bank,
-    oriented_distance,
-    oriented_energies,
-)
+from hwp_bench.metrics.pixels import ORIENTATIONS, filter_bank, oriented_distance, oriented_energies
 
 BENCHMARK = Path(__file__).parents[3] / "benchmarks" / "perceptual_order.py"
 

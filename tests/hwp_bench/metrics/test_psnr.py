@@ -9,8 +9,8 @@ import OpenImageIO as oiio
 import pytest
 
 from hwp_bench.base.errors import EmptyMask, ShapeMismatch
+from hwp_bench.metrics.pixels import decibels, squared_error
 from hwp_bench.metrics.protocol import PSNR_CAP
-from hwp_bench.metrics.psnr_ssim import decibels, squared_error
 from hwp_bench.metrics.score import score_frame
 
 

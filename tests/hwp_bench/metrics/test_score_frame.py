@@ -14,10 +14,18 @@ from skimage.metrics import structural_similarity
 from hwp_bench.base.errors import BadImage, BadPrediction, EmptyMask, ShapeMismatch
 from hwp_bench.base.images import as_uint8
 from hwp_bench.metrics import HWP_V1, PAPER_WILDGHAND, metric, metric_names
-from hwp_bench.metrics.oriented_distance import oriented_distance
-from hwp_bench.metrics.pixels import bounding_box, crop, hand_pixels, scored_pixels
+from hwp_bench.metrics.pixels import (
+    bounding_box,
+    crop,
+    decibels,
+    hand_pixels,
+    oriented_distance,
+    scored_pixels,
+    squared_error,
+    ssim_box,
+    ssim_map,
+)
 from hwp_bench.metrics.protocol import PSNR_CAP
-from hwp_bench.metrics.psnr_ssim import decibels, squared_error, ssim_box, ssim_map
 from hwp_bench.metrics.score import score_frame
 
 

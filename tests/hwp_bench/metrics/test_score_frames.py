@@ -7,8 +7,7 @@ import pytest
 
 from hwp_bench.base.errors import BadPrediction, ShapeMismatch
 from hwp_bench.metrics import HWP_V1, penalty
-from hwp_bench.metrics.batch import Frame, score_frames
-from hwp_bench.metrics.score import score_frame
+from hwp_bench.metrics.score import Frame, score_frame, score_frames
 
 
 def frames(count: int) -> list[Frame]:

@@ -11,9 +11,8 @@ from skimage.metrics import structural_similarity
 
 from hwp_bench.base.errors import EmptyMask, ShapeMismatch
 from hwp_bench.base.images import as_uint8
-from hwp_bench.metrics.pixels import bounding_box
+from hwp_bench.metrics.pixels import bounding_box, ssim_box, ssim_map
 from hwp_bench.metrics.protocol import HWP_V1, PAPER_WILDGHAND
-from hwp_bench.metrics.psnr_ssim import ssim_box, ssim_map
 from hwp_bench.metrics.score import score_frame
 
 GAUSSIAN = {

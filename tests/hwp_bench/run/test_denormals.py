@@ -12,7 +12,7 @@ import pytest
 from denormal_probe import Probe, states
 from small_captures import CaptureMaker
 
-from hwp_bench.base.denormals import flushed, flushed_process, flushes, set_flush
+from hwp_bench.base.numerics import flushed, flushed_process, flushes, set_flush
 from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.manifest import read_manifest

@@ -19,7 +19,7 @@ from typing import Any
 import pytest
 from small_captures import CaptureMaker
 
-from hwp_bench.base import threads
+from hwp_bench.base import numerics as threads
 from hwp_bench.base.errors import UsageError
 from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.cli import program

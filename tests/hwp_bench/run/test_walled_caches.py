@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from hostile import folder_of, hostile_method
 
-from hwp_bench.base.trees import open_up
+from hwp_bench.base.folders import open_up
 from hwp_bench.methods.manifest import read_manifest
 from hwp_bench.run.runner import run_method
 from hwp_bench.run.sandbox.confinement import Confinement
@@ -77,7 +77,7 @@ print("{{}}")
 
 CALL = """
 import numpy as np
-from hwp_bench.metrics.ssim_kernel import similarity
+from hwp_bench.metrics.pixels import similarity
 row = np.ones(4)
 similarity((row, row), (row, row), row.copy(), (0.1, 0.1, 1.0))
 print("called")

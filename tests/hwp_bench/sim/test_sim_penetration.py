@@ -19,7 +19,7 @@ from benchmarks.penetration import (
     segments,
     self_penetration,
 )
-from hwp_bench.hands.gestures import gestures
+from hwp_bench.hands.poses import gestures
 from hwp_bench.sim.scene.motion import moment_of_key
 from hwp_bench.sim.scene.reader import load_scene, scene_names
 from hwp_bench.sim.scene.schema import HandKey

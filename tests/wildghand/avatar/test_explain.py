@@ -16,8 +16,8 @@ from hwp_bench.base.errors import UsageError
 from hwp_bench.base.images import read_rgb
 from hwp_bench.capture import Capture
 from wildghand.avatar.avatar import WildGHandAvatar
-from wildghand.avatar.explain import explain_frames, explanation_sheet
 from wildghand.avatar.files import save_avatar
+from wildghand.avatar.render import explain_frames, explanation_sheet
 from wildghand.cli.main import main
 
 

@@ -12,8 +12,7 @@ from hypothesis.extra import numpy as hnp
 from hwp_bench.base.errors import UsageError
 from hwp_bench.hands import anatomical_limits, joint_limit_penalty, load_template, pose_hand
 from wildghand.avatar.avatar import WildGHandAvatar
-from wildghand.avatar.hand_angles import ANGLE_NAMES, REST, HandAngles
-from wildghand.avatar.studio import Pose, Studio
+from wildghand.avatar.studio import ANGLE_NAMES, REST, HandAngles, Pose, Studio
 
 SIDES = ("right", "left")
 HANDS = {side: HandAngles.of("anny", side) for side in SIDES}

@@ -5,9 +5,6 @@ from __future__ import annotations
 import base64
 import io
 import re
-import sys
-import types
-from importlib.machinery import ModuleSpec
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +12,8 @@ import pytest
 from PIL import Image
 
 from hwp_bench.base.errors import UsageError
-from wildghand.avatar.avatar import WildGHandAvatar
-from wildghand.avatar.inline import TURN_FRAMES, over
+from wildghand.avatar.avatar import TURN_FRAMES, WildGHandAvatar, over
+from wildghand.page import show_page
 
 
 def test_a_pose_is_a_picture_that_is_stored_whole(tiny_avatar: WildGHandAvatar) -> None:
@@ -44,18 +41,15 @@ def test_without_a_pose_the_avatar_turns(tiny_avatar: WildGHandAvatar) -> None:
     assert np.abs(frames[0] - expected).mean() < 6.0 < np.abs(frames[1] - frames[0]).mean()
 
 
-def test_where_a_page_can_be_written_it_is_shown(
+def test_a_page_is_shown_where_a_notebook_takes_one(
     tiny_avatar: WildGHandAvatar, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def write_page(avatar: object, path: Path) -> None:
+    def write(avatar: object, path: Path) -> None:
         assert avatar is tiny_avatar
         path.write_text("<p>turn \u21bb me</p>", encoding="utf-8")
 
-    module = types.ModuleType("wildghand.page")
-    module.__spec__ = ModuleSpec("wildghand.page", None)
-    module.write_page = write_page  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "wildghand.page", module)
-    bundle = tiny_avatar.show(size=32, interactive=True)._repr_mimebundle_()
+    monkeypatch.setattr("wildghand.page.write.write_page", write)
+    bundle = show_page(tiny_avatar, size=32)._repr_mimebundle_()
     (data,) = re.findall(r'<iframe src="data:text/html;base64,([^"]+)"', bundle["text/html"])
     assert base64.b64decode(data).decode() == "<p>turn \u21bb me</p>"
     assert "image/png" not in bundle

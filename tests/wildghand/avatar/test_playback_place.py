@@ -11,7 +11,7 @@ import pytest
 from small_captures import CaptureMaker
 
 from hwp_bench.base.errors import UsageError
-from wildghand.avatar.playback import render_clip
+from wildghand.avatar.render import render_clip
 
 
 def test_an_existing_folder_is_refused_with_the_option_that_replaces_it(

@@ -34,8 +34,8 @@ def test_they_are_read_as_they_were_written(former: bool) -> None:
         tensors = {
             name.replace("color_changes_", "other_hand_"): value for name, value in tensors.items()
         }
-        assert ColorChanges.from_tensors(tensors, COUNTS, "an avatar") is None
-    read = ColorChanges.from_tensors(rename_former(tensors), COUNTS, "an avatar")
+        assert ColorChanges.from_tensors(tensors, "an avatar", N=COUNTS) is None
+    read = ColorChanges.from_tensors(rename_former(tensors), "an avatar", N=COUNTS)
     assert read is not None
     for side, change in made.changes.items():
         assert torch.equal(read.changes[side], change)
@@ -53,5 +53,5 @@ def test_hostile_changes_are_refused_by_name(value: torch.Tensor | None) -> None
     else:
         tensors["color_changes_left"] = value
     with pytest.raises(BadInput, match="color_changes_left"):
-        ColorChanges.from_tensors(tensors, COUNTS, "an avatar")
-    assert ColorChanges.from_tensors({}, COUNTS, "an avatar") is None
+        ColorChanges.from_tensors(tensors, "an avatar", N=COUNTS)
+    assert ColorChanges.from_tensors({}, "an avatar", N=COUNTS) is None

@@ -130,18 +130,18 @@ def test_an_avatar_keeps_its_evidence(make_training: TrainingMaker, tmp_path: Pa
     ("change", "message"),
     [
         ({"evidence_offsets_right": torch.zeros(3)}, "shape"),
-        ({"evidence_shapes_right": None}, "shape"),
+        ({"evidence_shapes_right": None}, "is missing"),
         ({"evidence_shapes_right": torch.full((4,), 1.5)}, "0 to 1"),
         ({"evidence_offsets_right": torch.full((4,), float("nan"))}, "0 to 1"),
-        ({"evidence_wall_right": None}, "shape"),
+        ({"evidence_wall_right": None}, "is missing"),
     ],
 )
 def test_damaged_evidence_is_refused(change: dict[str, torch.Tensor | None], message: str) -> None:
     tensors = {**evidence(0.5, 0.5, 4).to_tensors(), **change}
     kept = {name: tensor for name, tensor in tensors.items() if tensor is not None}
     with pytest.raises(BadInput, match=message):
-        Evidence.from_tensors(kept, {"right": 4}, "avatar")
+        Evidence.from_tensors(kept, "avatar", N={"right": 4})
 
 
 def test_an_avatar_of_before_has_none() -> None:
-    assert Evidence.from_tensors({}, {"right": 4}, "avatar") is None
+    assert Evidence.from_tensors({}, "avatar", N={"right": 4}) is None

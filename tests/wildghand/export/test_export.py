@@ -31,13 +31,16 @@ from hwp_bench.methods.contract import Camera, HandPose
 from wildghand.avatar.avatar import PosedGaussians, WildGHandAvatar
 from wildghand.avatar.files import save_avatar
 from wildghand.cli.main import main
-from wildghand.export.all_round import SH_CONSTANT
 from wildghand.export.formats import FORMATS, ExportSettings, export
-from wildghand.export.glb import GlbBuilder
-from wildghand.export.placing import scaled
-from wildghand.export.ply import ply_bytes
-from wildghand.export.skinned_glb import quaternions, strongest
-from wildghand.export.spz import FRACTIONAL_BITS, packed_rotations, spz_bytes
+from wildghand.export.mesh import quaternions, strongest
+from wildghand.export.splat_files import (
+    FRACTIONAL_BITS,
+    GlbBuilder,
+    packed_rotations,
+    ply_bytes,
+    spz_bytes,
+)
+from wildghand.export.splats import SH_CONSTANT, scaled
 
 
 @pytest.fixture(scope="module")
@@ -230,7 +233,7 @@ def attribute(made: pygltflib.GLTF2, name: str) -> np.ndarray:
 @pytest.mark.slow
 def test_a_glb_of_gaussians_is_the_one_that_splat_transform_writes(tmp_path: Path) -> None:
     """Both files are made of the same Gaussians and hold the same arrays."""
-    from wildghand.export.splat_glb import EXTENSION, splat_glb_bytes
+    from wildghand.export.splat_files import EXTENSION, splat_glb_bytes
 
     splats = some_splats()
     mine, theirs = tmp_path / "mine.glb", tmp_path / "theirs.glb"

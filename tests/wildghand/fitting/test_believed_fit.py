@@ -24,10 +24,9 @@ from wildghand.avatar.files import load_avatar, save_avatar
 from wildghand.export.formats import ExportSettings, export
 from wildghand.fitting import believed_poses
 from wildghand.fitting.method import WildGHandMethod
-from wildghand.page.poses import sample_poses
-from wildghand.page.settings import PageSettings
+from wildghand.page.poses import PageSettings, sample_poses
 from wildghand.poses import ClipPoses
-from wildghand.viewer.motion import Motion
+from wildghand.viewer.posed_view import Motion
 
 TrainingMaker = Callable[..., TrainingCapture]
 

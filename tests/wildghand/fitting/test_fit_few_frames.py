@@ -11,7 +11,7 @@ import pytest
 from small_captures import CaptureMaker
 
 from hwp_bench.capture import Capture, CaptureWriter
-from hwp_bench.capture.tracks import Cameras
+from hwp_bench.capture.schema import Cameras
 from wildghand.avatar.files import load_avatar
 from wildghand.cli.main import main
 

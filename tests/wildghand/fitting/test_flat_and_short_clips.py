@@ -15,7 +15,7 @@ from tiny_fits import TINY
 
 from hwp_bench.base.errors import BadInput
 from hwp_bench.capture import Capture
-from hwp_bench.capture.splits.split import Split
+from hwp_bench.capture.splits import Split
 from hwp_bench.methods.contract import Budget, RunSettings, TrainingCapture
 from hwp_bench.methods.request import open_request, write_request
 from hwp_bench.metrics.score import score_frame

@@ -11,7 +11,7 @@ from painted import QUICK, SilentReport
 
 from hwp_bench.methods.contract import Budget, TrainingCapture
 from wildghand.avatar.avatar import WildGHandAvatar
-from wildghand.avatar.weight_masks import write_weight_masks
+from wildghand.avatar.files import write_weight_masks
 from wildghand.fitting.method import WildGHandMethod
 from wildghand.from_video.sheet import COLUMNS, avatar_sheet
 from wildghand.from_video.turntable import BACKGROUND, Turntable

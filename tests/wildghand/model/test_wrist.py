@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from hwp_bench.hands import load_template, pose_hand, project
 from hwp_bench.hands.raster import draw_faces
-from hwp_bench.hands.topology import open_loops
+from hwp_bench.hands.template import open_loops
 from wildghand.gaussians.rig import HandRig, make_rig
 from wildghand.model.dress import Gaussians
 from wildghand.model.rasterize_hands import rasterize_hands

@@ -26,9 +26,7 @@ from wildghand.avatar import WildGHandAvatar, save_avatar
 from wildghand.cli.main import main
 from wildghand.page import bake_hand, write_page
 from wildghand.page.bake import joint_motions
-from wildghand.page.measure import draw_baked
-from wildghand.page.poses import sample_poses
-from wildghand.page.settings import PageSettings
+from wildghand.page.poses import PageSettings, draw_baked, sample_poses
 
 QUICK: dict[str, Any] = {**TINY, "gaussians": 600}
 SMALL = PageSettings(clip_samples=16, random_samples=12, still_size=48)

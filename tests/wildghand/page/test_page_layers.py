@@ -23,9 +23,8 @@ from wildghand.avatar import WildGHandAvatar, load_avatar, save_avatar
 from wildghand.fitting.fit import Fit
 from wildghand.model.settings import read_settings
 from wildghand.page import bake_hand, write_page
-from wildghand.page.biases import bake_biases
-from wildghand.page.settings import PageSettings
-from wildghand.page.weights import mean_weights
+from wildghand.page.bake import bake_biases
+from wildghand.page.poses import PageSettings, mean_weights
 from wildghand.splat import rasterize
 
 QUICK: dict[str, Any] = {**TINY, "gaussians": 600}

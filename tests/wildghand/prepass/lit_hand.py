@@ -9,8 +9,8 @@ import numpy as np
 from hwp_bench.base.colors import linear_to_srgb
 from hwp_bench.capture import Cameras
 from hwp_bench.hands import load_template
-from hwp_bench.hands.footprint import HandSurfaces
-from hwp_bench.hands.parameters import HandParameters
+from hwp_bench.hands.anchors import HandSurfaces
+from hwp_bench.hands.skeleton import HandParameters
 from wildghand.prepass import FrameAssessment, PrepassInput
 
 FRAMES, SIZE = 24, 96

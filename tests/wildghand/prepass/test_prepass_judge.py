@@ -26,7 +26,7 @@ from hwp_bench.base.errors import BadInput, ShapeMismatch
 from hwp_bench.capture import CaptureWriter, open_capture
 from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.hands import load_template
-from hwp_bench.hands.footprint import HandSurfaces
+from hwp_bench.hands.anchors import HandSurfaces
 from wildghand.prepass import (
     FrameAssessment,
     PrepassInput,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from hwp_bench.base.denormals import flushed, flushes
+from hwp_bench.base.numerics import flushed, flushes
 from hwp_bench.methods.contract import Budget
 from wildghand.fitting.method import WildGHandMethod
 from wildghand.splat import threads

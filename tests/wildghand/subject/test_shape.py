@@ -24,11 +24,11 @@ def a_shape() -> SubjectShape:
 
 def test_a_kept_shape_is_read_again_to_the_bit() -> None:
     shape = a_shape()
-    read = SubjectShape.from_tensors(shape.to_tensors(), RIGHT, "model")
+    read = SubjectShape.from_tensors(shape.to_tensors(), "model", V=len(RIGHT.vertices))
     assert read is not None
     np.testing.assert_array_equal(read.vertices, shape.vertices)
     np.testing.assert_array_equal(read.joints, shape.joints)
-    assert SubjectShape.from_tensors({}, RIGHT, "model") is None
+    assert SubjectShape.from_tensors({}, "model", V=len(RIGHT.vertices)) is None
 
 
 def test_the_left_hand_is_the_mirror_image() -> None:
@@ -55,11 +55,11 @@ def test_what_is_no_shape_is_refused_by_name(
     tensors = a_shape().to_tensors()
     tensors[f"subject_{name}"] = damage(tensors[f"subject_{name}"])
     with pytest.raises(BadInput, match=f"subject_{name}"):
-        SubjectShape.from_tensors(tensors, RIGHT, "model.safetensors")
+        SubjectShape.from_tensors(tensors, "model.safetensors", V=len(RIGHT.vertices))
 
 
 def test_a_part_that_is_missing_is_named() -> None:
     tensors = a_shape().to_tensors()
     del tensors["subject_joints"]
     with pytest.raises(BadInput, match="subject_joints"):
-        SubjectShape.from_tensors(tensors, RIGHT, "model.safetensors")
+        SubjectShape.from_tensors(tensors, "model.safetensors", V=len(RIGHT.vertices))

@@ -20,13 +20,12 @@ from benchmarks.patience import Patience, spent_by
 from hwp_bench.base.images import read_rgb
 from hwp_bench.capture import Cameras, Capture, CaptureWriter, open_capture
 from hwp_bench.hands import HandParameters
-from wildghand.avatar.avatar import WildGHandAvatar
+from wildghand.avatar.avatar import WildGHandAvatar, over
 from wildghand.avatar.files import save_avatar
-from wildghand.avatar.inline import over
 from wildghand.cli.main import main
 from wildghand.fitting import fit_capture
 from wildghand.viewer.live import serve_fit
-from wildghand.viewer.motion import Motion
+from wildghand.viewer.posed_view import Motion
 from wildghand.viewer.server import Address
 from wildghand.viewer.view import ServedView, ViewSettings, serve_view
 

@@ -15,18 +15,23 @@ from scipy.spatial.transform import Rotation
 from hwp_bench.base.errors import UsageError
 from hwp_bench.capture import Capture
 from hwp_bench.methods.contract import Camera
-from wildghand.avatar.avatar import WildGHandAvatar
-from wildghand.avatar.inline import over
+from wildghand.avatar.avatar import WildGHandAvatar, over
 from wildghand.fitting.glance import Glance
-from wildghand.viewer.cameras import PageCamera, viewpoint
-from wildghand.viewer.guard import refusal
-from wildghand.viewer.live_sheet import live_sheet
-from wildghand.viewer.motion import Motion, capture_of
-from wildghand.viewer.pace import LEAST, MOST, TARGET, Pace
-from wildghand.viewer.painter import Painter
-from wildghand.viewer.player import Player
-from wildghand.viewer.posed_view import PosedView
-from wildghand.viewer.posing import shown_angles, with_angle, with_fingers
+from wildghand.viewer.live import live_sheet
+from wildghand.viewer.posed_view import (
+    Motion,
+    PageCamera,
+    Painter,
+    Player,
+    PosedView,
+    capture_of,
+    shown_angles,
+    viewpoint,
+    with_angle,
+    with_fingers,
+)
+from wildghand.viewer.screen import LEAST, MOST, TARGET, Pace
+from wildghand.viewer.server import refusal
 
 
 def psnr(first: np.ndarray, second: np.ndarray) -> float:

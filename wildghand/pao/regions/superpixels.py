@@ -13,9 +13,9 @@ from typing import Protocol
 import numpy as np
 
 from hwp_bench.base.arrays import read_npz, take, write_npz
-from hwp_bench.base.caches import trim
 from hwp_bench.base.errors import BadInput, HwpError, UsageError
 from hwp_bench.base.files import cache_root, sha256_json
+from hwp_bench.base.folders import trim
 from hwp_bench.base.images import pixel_digest
 from wildghand.pao.regions.frame_regions import FrameRegions, partition
 

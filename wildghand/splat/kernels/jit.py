@@ -9,7 +9,7 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-from hwp_bench.base import compiled as compiler
+from hwp_bench.base import kernels as compiler
 from wildghand.splat.kernels.vectors import atomic_add_one
 
 

@@ -14,7 +14,7 @@ from hwp_bench.analysis.statistics.compare import compare, macro_by_seed, standi
 from hwp_bench.analysis.statistics.pairing import group_runs, refuse_unlike, scopes
 from hwp_bench.base.errors import UsageError
 from hwp_bench.cli.main import main
-from hwp_bench.metrics.aggregate import aggregate
+from hwp_bench.metrics.score import aggregate
 from hwp_bench.results import Results, write_results
 from hwp_bench.results.schema import score_rows
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from hwp_bench.base.console import clock, remaining
 from hwp_bench.base.errors import BadMethod, UsageError
-from hwp_bench.base.progress import clock, remaining
 from hwp_bench.evaluation.ablate.design import make_design
 from hwp_bench.methods.manifest import MethodManifest, read_manifest
 

@@ -14,8 +14,7 @@ import pytest
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.images import read_rgb
 from hwp_bench.capture import Capture, CaptureWriter, open_capture
-from hwp_bench.capture.schema import TRUE_TEMPLATE
-from hwp_bench.capture.subject_mesh import write_subject_mesh
+from hwp_bench.capture.schema import TRUE_TEMPLATE, write_subject_mesh
 from hwp_bench.cli.main import main
 from hwp_bench.evaluation.budget.runs import run_budget, variants_of
 from hwp_bench.evaluation.evaluate import EvaluationSettings

@@ -7,8 +7,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hwp_bench.base.colors import linear_to_srgb, srgb_to_linear
-from hwp_bench.base.harmonics import harmonics
+from hwp_bench.base.colors import harmonics, linear_to_srgb, srgb_to_linear
 from hwp_bench.evaluation.budget.budget import gained
 from hwp_bench.evaluation.budget.corrections import CORRECTIONS
 from hwp_bench.evaluation.budget.pair import Pair

@@ -16,8 +16,8 @@ from hwp_bench.evaluation.budget.motion import motion, pose
 from hwp_bench.evaluation.budget.pair import Pair
 from hwp_bench.evaluation.budget.surface import MovingSurface
 from hwp_bench.hands import load_template
-from hwp_bench.hands.parameters import Camera, HandPose
 from hwp_bench.hands.raster import draw_faces, mix_corners
+from hwp_bench.hands.skeleton import Camera, HandPose
 from hwp_bench.hands.skinning import pose_hand, project
 
 SIZE = 64

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hwp_bench.base.errors import BadInput
-from hwp_bench.base.movies import write_movie
+from hwp_bench.base.images import write_movie
 from hwp_bench.importers.video.decode import FrameRange, probe, read_frames
 
 FRAMES = [np.full((48, 64, 3), 40 * index, dtype=np.uint8) for index in range(4)]

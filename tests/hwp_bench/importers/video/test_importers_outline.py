@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from synthetic_clip import make_clip
 
-from hwp_bench.hands.topology import boundary_vertices
+from hwp_bench.hands.template import boundary_vertices
 from hwp_bench.importers.video.clip_masks import beyond_wrist
 from hwp_bench.importers.video.contour import FIELD_SIZE, match_outline, signed_distance
 

@@ -10,7 +10,7 @@ from scipy.stats import multivariate_normal
 from synthetic_clip import CUP, HEIGHT, WIDTH, SyntheticClip, make_clip
 
 from hwp_bench.hands.raster import draw_silhouette, overlap
-from hwp_bench.hands.topology import boundary_vertices
+from hwp_bench.hands.template import boundary_vertices
 from hwp_bench.importers.video.clip_masks import beyond_wrist
 from hwp_bench.importers.video.colour_model import ColourModel, evidence, learn_colours
 from hwp_bench.importers.video.segmentation import WIDE, Prompt, Segmentation, segment_clip, to_lab

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from hwp_bench.base.errors import UsageError
-from hwp_bench.base.machine_code import KEPT
+from hwp_bench.base.kernels import KEPT
 from hwp_bench.base.packages import data_folder
 from hwp_bench.run.sandbox.confinement import (
     Confinement,

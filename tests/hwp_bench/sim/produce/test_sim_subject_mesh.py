@@ -15,7 +15,7 @@ from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.schema import TRUE_TEMPLATE
 from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.hands import HandTemplate
-from hwp_bench.hands.footprint import HandSurfaces
+from hwp_bench.hands.anchors import HandSurfaces
 from hwp_bench.hands.raster import overlap
 from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.material import frames_with, known_truths

@@ -13,7 +13,7 @@ import pytest
 
 from hwp_bench.base.errors import BadInput
 from hwp_bench.hands import load_template
-from hwp_bench.hands.posed_skeleton import RestSkeleton, posed_skeleton, rest_skeleton, turned
+from hwp_bench.hands.poses import RestSkeleton, posed_skeleton, rest_skeleton, turned
 from hwp_bench.sim.effects.plan import plan
 from hwp_bench.sim.produce.estimates import estimate_hands
 from hwp_bench.sim.produce.production import true_hands

@@ -12,9 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from hwp_bench.base.embree import EmbreeMesh, library
-from hwp_bench.base.on_face import places_on_faces
-from hwp_bench.base.ray_mesh import EmbreexMesh
+from hwp_bench.base.rays import EmbreeMesh, EmbreexMesh, library, places_on_faces
 from hwp_bench.sim.geometry.raycast import Tracer
 from hwp_bench.sim.render.shading import openness
 
@@ -136,5 +134,5 @@ def test_a_place_is_on_its_face_and_on_the_ray(corners: np.ndarray, seed: int) -
 
 
 def test_a_tracer_works_through_embreex_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hwp_bench.base.embree.library", lambda: None)
+    monkeypatch.setattr("hwp_bench.base.rays.library", lambda: None)
     test_hits_lie_on_the_sphere()

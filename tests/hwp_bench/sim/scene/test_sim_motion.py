@@ -12,7 +12,7 @@ from tiny_scene import SINGLE
 
 from hwp_bench.base.errors import BadInput
 from hwp_bench.hands import load_template
-from hwp_bench.hands.gestures import LIMITS, finger_pose, gesture, gestures, within_limits
+from hwp_bench.hands.poses import LIMITS, finger_pose, gesture, gestures, within_limits
 from hwp_bench.sim.scene.motion import HandMoment, hand_parameters, heading_matrix, track_moment
 from hwp_bench.sim.scene.optics import focus_point, intrinsics, pixel_rays, viewmat
 from hwp_bench.sim.scene.reader import parse_scene

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hwp_bench.base.errors import BadInput
-from hwp_bench.hands.gestures import FIRST_JOINT
+from hwp_bench.hands.poses import FIRST_JOINT
 from hwp_bench.sim.effects.plan import hands_at, plan
 from hwp_bench.sim.geometry.mesh import surface_normals
 from hwp_bench.sim.geometry.raycast import RenderCost

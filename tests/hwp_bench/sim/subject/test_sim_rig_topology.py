@@ -25,7 +25,7 @@ from benchmarks.rig_files import (
 )
 from hwp_bench.base.errors import BadHandModel
 from hwp_bench.hands import HandTemplate, load_template
-from hwp_bench.hands.topology import boundary_loop
+from hwp_bench.hands.template import boundary_loop
 from hwp_bench.sim.render.frame import render_frame
 from hwp_bench.sim.scene.schema import Scene
 from hwp_bench.sim.subject.joint_names import hand_joints
@@ -286,7 +286,7 @@ def test_a_rest_pose_of_its_own_becomes_the_hand_models(tmp_path: Path, free: Ha
     import torch
 
     from hwp_bench.hands import pose_hand
-    from hwp_bench.hands.gestures import finger_pose, gesture
+    from hwp_bench.hands.poses import finger_pose, gesture
     from hwp_bench.hands.template import rebuilt
 
     pose = np.vstack([np.zeros(3), 0.4 * finger_pose(gesture("fist"), free.joints)])

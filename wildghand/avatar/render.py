@@ -1,0 +1,203 @@
+"""Drawing an avatar along a capture: a clip, and what DPD took out of its frames."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from hwp_bench.base.console import track
+from hwp_bench.base.drawing import labelled, sheet
+from hwp_bench.base.errors import UsageError
+from hwp_bench.base.files import atomic_folder, check_places
+from hwp_bench.base.images import as_uint8, check_encoder, write_image, write_movie
+from hwp_bench.capture import Capture
+from wildghand.avatar.avatar import WildGHandAvatar
+from wildghand.gaussians.training import TrainingClip
+from wildghand.model.model import WildGHandModel
+from wildghand.model.rendered import largest
+from wildghand.splat.threads import denormals_flushed
+
+
+def render_clip(
+    avatar: WildGHandAvatar,
+    capture: Capture,
+    frames: range,
+    out: Path,
+    *,
+    background: int = 0,
+    video: Path | None = None,
+    overwrite: bool = False,
+) -> dict[str, Any]:
+    """Draw frames into a folder, whole or not at all.
+
+    Args:
+        avatar: what is drawn.
+        capture: whose hand parameters and cameras are used.
+        frames: which of its frames.
+        out: the folder.
+        background: grey level behind the hand, 0 to 255.
+        video: MP4 file (H.264) to write, too.
+        overwrite: replace what exists.
+
+    Returns:
+        Number of frames, and frames drawn in a second.
+
+    Raises:
+        UsageError: the capture shows no hand that the avatar has, or belongs to another hand
+            model; or the video lies in the folder, or the folder in the capture.
+        MissingDependency: a video is asked for, and PyAV is not installed.
+        HwpError: the video cannot be written.
+    """
+    check_places({"out": out, "video": video}, {"poses": capture.root}, replaces=overwrite)
+    sides = shown_sides(avatar, capture)
+    if video is not None:
+        check_encoder()
+    seconds, images = 0.0, []
+    with atomic_folder(out, overwrite=overwrite, flag="--overwrite") as folder:
+        for frame in track(frames, "Drawing"):
+            poses, camera = capture.hand_poses(frame), capture.camera(frame)
+            started = time.perf_counter()
+            rgba = avatar.render({side: poses[side] for side in sides}, camera)
+            seconds += time.perf_counter() - started
+            behind = (1.0 - rgba[..., 3:]) * (background / 255.0)
+            image = np.rint(255.0 * (rgba[..., :3] + behind)).clip(0, 255).astype(np.uint8)
+            write_image(folder / f"{frame:06d}.png", image)
+            if video is not None:
+                images.append(image)
+        if video is not None:
+            # Within the block: where the video cannot be written, no folder refuses the next start.
+            write_movie(video, images, capture.info.fps)
+    return {"frames": len(frames), "frames_per_second": len(frames) / max(seconds, 1e-9)}
+
+
+def shown_sides(avatar: WildGHandAvatar, capture: Capture) -> list[str]:
+    """Return the hands of a capture that an avatar has."""
+    sides = [side for side in capture.info.sides if side in avatar.sides]
+    if not sides:
+        raise UsageError(
+            f"shows the {' and '.join(capture.info.sides)} hand, the avatar is of the "
+            f"{' and '.join(avatar.sides)} hand",
+            where=capture.root,
+        )
+    if capture.info.hand_model.name != avatar.hand_model.name:
+        raise UsageError(
+            f"has parameters of the hand model {capture.info.hand_model.name}, "
+            f"the avatar takes those of {avatar.hand_model.name}",
+            where=capture.root,
+            remedy="Convert them with `hwp-bench hands convert`.",
+        )
+    return sides
+
+
+#: How much a difference of colours is stretched around grey in a picture.
+_STRETCH = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """One training frame, and the avatar's part in it."""
+
+    #: Frame of the capture.
+    frame: int
+    #: Temporal weight of largest magnitude among the hands.
+    omega: float
+    #: (H, W, 3) sRGB in [0, 1]: the frame over black outside the estimated mask.
+    image: np.ndarray
+    #: (H, W, 3) the hand as the avatar draws it: no bias, no gain.
+    canonical: np.ndarray
+    #: (H, W, 3) the hand with the frame's biases and gain.
+    biased: np.ndarray
+
+
+@denormals_flushed()
+@torch.no_grad()
+def explain_frames(
+    avatar: WildGHandAvatar, capture: Capture, frames: Sequence[int] | None = None
+) -> list[Explanation]:
+    """Draw training frames without and with what is particular to them.
+
+    Args:
+        frames: of the capture; None: the eight of largest temporal weight, in order of time.
+    """
+    model, fitted = avatar.model, avatar.record.frames
+    if not model.perturbation:
+        raise UsageError(
+            "was fitted without DPD", field="avatar", remedy="Fit it with dpd.enabled=true."
+        )
+    origin = avatar.record.source.get("capture")
+    if origin not in (None, capture.info.id) or not fitted or max(fitted) >= len(capture):
+        raise UsageError(
+            f"was fitted to {str(origin)[:100]!r}, not to {capture.info.id!r}", field="avatar"
+        )
+    rows = torch.arange(len(fitted))
+    omegas = largest([hand.temporal(rows).omega for hand in model.biases]).abs()
+    if frames is None:
+        frames = sorted(fitted[row] for row in omegas.argsort(descending=True)[:8].tolist())
+    for frame in frames:
+        if frame not in fitted:
+            raise UsageError(f"{frame} was not fitted", field="frames")
+    clip = TrainingClip(capture, np.array(fitted), model.rigs, torch.device("cpu"))
+    found = []
+    for frame in frames:
+        row = fitted.index(frame)
+        biased, canonical = (
+            _drawn(model, clip, row, capture, avatar.settings.heads.refinement, biases=on)
+            for on in (True, False)
+        )
+        mask = capture.mask(frame)[..., None] / 255.0
+        found.append(
+            Explanation(
+                frame, float(omegas[row]), capture.frame(frame) / 255.0 * mask, canonical, biased
+            )
+        )
+    return found
+
+
+def explanation_sheet(
+    found: Sequence[Explanation], names: Mapping[int, str] | None = None
+) -> np.ndarray:
+    """A sheet with a row for each frame.
+
+    Returns:
+        (H, W, 3) uint8: frame, without biases, with biases, and the difference of the two, grey
+        where there is none.
+    """
+    tiles = []
+    for item in found:
+        acting = (names or {}).get(item.frame, "")
+        difference = 0.5 + _STRETCH * (item.biased - item.canonical)
+        for picture, caption in (
+            (item.image, f"frame {item.frame} {acting}"),
+            (item.canonical, "canonical"),
+            (item.biased, f"with biases, omega {item.omega:.2f}"),
+            (difference, f"difference x {_STRETCH:g}"),
+        ):
+            tiles.append(labelled(as_uint8(np.clip(picture, 0.0, 1.0).astype(np.float32)), caption))
+    return sheet(tiles, 4)
+
+
+def _drawn(
+    model: WildGHandModel,
+    clip: TrainingClip,
+    row: int,
+    capture: Capture,
+    refine: bool,
+    *,
+    biases: bool,
+) -> np.ndarray:
+    rows = torch.tensor([row])
+    kept = {side: torch.tensor([biases]) for side in model.perturbation}
+    info = capture.info
+    drawing = model.draw_frames(
+        clip, rows, info.width, info.height, kept=kept, move=True, refine=refine
+    )
+    image = drawing.image[0]
+    if not biases:
+        image = image / model.log_gains[row].exp()
+    return image.clamp(0.0, 1.0).numpy()
