@@ -27,7 +27,7 @@ import numpy as np
 from benchmarks.engine_work import INPUT_BYTES, Wait
 from hwp_bench.run.engine import Engine, Folder, Job, LocalEngine
 from hwp_bench.run.engine.job import OnProgress
-from hwp_bench.run.engine.parallel import ParallelEngine
+from hwp_bench.run.engine.processes import ParallelEngine
 
 #: Captures, variants and seeds of the modelled study.
 STUDY = (11, 4, 3)
@@ -115,7 +115,7 @@ def measure_ray(
 ) -> dict[int, list[float]]:
     from ray.cluster_utils import Cluster
 
-    from hwp_bench.run.engine.ray_engine import RayEngine
+    from hwp_bench.run.engine.ray import RayEngine
 
     times: dict[int, list[float]] = {}
     with ExitStack() as stack:

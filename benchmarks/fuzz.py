@@ -154,7 +154,7 @@ TARGETS = (
 def preload() -> dict[str, Callable[[Sequence[str]], int]]:
     """Load every module that a command loads, so that a fork has them; return the programs."""
     from hwp_bench.cli.main import command_tree, main
-    from hwp_bench.cli.whole_parser import whole_parser
+    from hwp_bench.cli.program import whole_parser
     from wildghand.cli.main import command_tree as hand_tree
     from wildghand.cli.main import main as hand_main
 
@@ -165,7 +165,7 @@ def preload() -> dict[str, Callable[[Sequence[str]], int]]:
     torch.set_num_threads(1)  # a pool of threads does not live on in a fork
     for name in (
         "cv2", "OpenImageIO", "scipy.sparse", "scipy.spatial", "safetensors.torch", "psutil",
-        "hwp_bench.evaluation.evaluate", "hwp_bench.report.page.page", "hwp_bench.capture.check",
+        "hwp_bench.evaluation.evaluate", "hwp_bench.report.page", "hwp_bench.capture.check",
         "hwp_bench.leaderboard.entries", "hwp_bench.publish", "hwp_bench.sim",
         "hwp_bench.sim.produce.production", "wildghand.avatar.files", "wildghand.fitting",
         "wildghand.export.formats", "wildghand.from_video.api", "matplotlib",

@@ -24,7 +24,7 @@ import torch
 
 from benchmarks.landmark_errors import kept_clip, landmark_errors
 from benchmarks.tracker_clips import clip_source, make_clip, true_hand
-from hwp_bench.cli.overrides import overrides
+from hwp_bench.cli.options import overrides
 from hwp_bench.hands import HandTemplate, PosedHand, load_template, pose_hand
 from hwp_bench.hands.skeleton import FINGERS, HandParameters, finger_joints
 from hwp_bench.importers.video import FitSettings

@@ -14,7 +14,7 @@ from typing import Any, Literal
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.files import read_json, write_json
 from hwp_bench.base.records import Line, number, parse_record
-from hwp_bench.results.environment import environment
+from hwp_bench.results.schema import environment
 
 #: The file.
 STORE = Path(__file__).with_name("ratios.json")

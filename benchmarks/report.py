@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from hwp_bench.base.images import write_image
-from hwp_bench.report.page.render import write_report
+from hwp_bench.report.page import write_report
 from hwp_bench.report.sources import read_sources
 from hwp_bench.results import (
     CaptureResult,

@@ -35,7 +35,7 @@ from benchmarks.step_shares import Shares, by_component, shares_of
 from benchmarks.step_spans import marked, profiled
 from hwp_bench.base.files import atomic_write
 from hwp_bench.base.tables import Column, Table, print_table
-from hwp_bench.cli.overrides import overrides
+from hwp_bench.cli.options import overrides
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.gaussians.fit_loop import StepThreads, candidates
 

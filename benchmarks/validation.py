@@ -18,7 +18,7 @@ import numpy as np
 
 from hwp_bench.capture import open_capture
 from hwp_bench.capture.splits import contiguous_split
-from hwp_bench.cli.overrides import overrides
+from hwp_bench.cli.options import overrides
 from hwp_bench.evaluation.scoring import Prediction, mean_scores, read_targets, score_predictions
 from hwp_bench.methods import find_method, read_manifest
 from hwp_bench.methods.contract import Avatar, Budget, RunSettings

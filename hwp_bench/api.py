@@ -13,21 +13,26 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from hwp_bench.analysis.statistics.comparison import Comparison, compare_results
+from hwp_bench.analysis.compare import Comparison, compare_results
 from hwp_bench.base.console import JobsView, notice
 from hwp_bench.base.errors import UsageError, of_type, place, whole_number
 from hwp_bench.capture import Capture
-from hwp_bench.evaluation.evaluate import EvaluationSettings, default_folder
+from hwp_bench.evaluation.evaluate import (
+    EvaluationSettings,
+    check_call,
+    check_results_place,
+    check_suite,
+    default_folder,
+)
 from hwp_bench.evaluation.evaluate import evaluate as evaluate_method
-from hwp_bench.evaluation.foresight import check_call, check_results_place, check_suite
-from hwp_bench.evaluation.outcome import outcome_lines
+from hwp_bench.evaluation.sentences import outcome_lines
 from hwp_bench.methods.contract import Budget, RunSettings
 from hwp_bench.methods.manifest import find_method, read_manifest
 from hwp_bench.metrics.score import score_frame
-from hwp_bench.report.evaluation_tables import HEADLINE
+from hwp_bench.report.tables import HEADLINE
 from hwp_bench.results import Results, read_all
 from hwp_bench.run.engine import Engine, LocalEngine
-from hwp_bench.run.engine.parallel import ParallelEngine
+from hwp_bench.run.engine.processes import ParallelEngine
 from hwp_bench.sim.produce.suites import ensure_suite, suite_names
 
 #: A capture, its folder, or the name of a suite; `evaluate` takes one or several.

@@ -9,9 +9,8 @@ from dataclasses import replace
 from small_captures import results_example
 
 from hwp_bench.capture.splits import split_for
-from hwp_bench.evaluation.evaluation_key import key_of
-from hwp_bench.leaderboard.entries import Entry
-from hwp_bench.leaderboard.records import Check
+from hwp_bench.evaluation.capture_evaluation import key_of
+from hwp_bench.leaderboard.entries import Check, Entry
 from hwp_bench.leaderboard.site import board_page, shown_rows
 from hwp_bench.leaderboard.suite_data import read_suite_data
 from hwp_bench.metrics import PROTOCOLS, metric_names

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import importlib
 import re
 import shlex
 from collections.abc import Callable
@@ -76,7 +75,8 @@ def test_examples_are_accepted_by_their_commands(page: Path) -> None:
         while command.commands:
             command = command.commands[rest.pop(0)]
         parser = argparse.ArgumentParser(exit_on_error=False)
-        importlib.import_module(command.module).add_arguments(parser)
+        add_arguments, _ = command.load()
+        add_arguments(parser)
         try:
             parser.parse_args(rest)
         except (SystemExit, argparse.ArgumentError) as error:

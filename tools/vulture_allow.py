@@ -33,7 +33,6 @@ _._repr_mimebundle_  # notebooks call it
 _.up_direction  # viser reads it
 _.request_share_url  # viser's server calls it
 verbose  # viser's server passes it
-_.formatter_class  # argparse reads it
 _.channelnames  # OpenImageIO reads it
 _.camera_position  # pyvista reads it
 _.pareto  # read by the report's template

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hwp_bench.cli.options import add_actions, add_json, captures_of, print_json
+
 if TYPE_CHECKING:
-    from hwp_bench.leaderboard.entries import Entry
-    from hwp_bench.leaderboard.records import Submission
+    from hwp_bench.leaderboard.entries import Entry, Submission
 
 _EXAMPLES = """examples:
   hwp-bench leaderboard submit runs/mine-mini -o submission --by "A. Person"
@@ -92,25 +92,22 @@ _LINE = 1000
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.epilog = _EXAMPLES
-    actions = parser.add_subparsers(
-        dest="action", required=True, metavar="ACTION", help="what to do"
+    action = add_actions(parser)
+    add = action("add", "write entries of results into the folder of entries", _add, _ADD)
+    submit = action("submit", "make the folder of a pull request", _submit, _SUBMIT)
+    check = action(
+        "check", "check digests, protocol version, completeness of entries", _check, _CHECK
     )
-
-    def action(name: str, text: str, epilog: str = "") -> argparse.ArgumentParser:
-        added = actions.add_parser(
-            name,
-            help=text,
-            description=text[0].upper() + text[1:] + ".",
-            epilog=epilog,
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
-        added.add_argument(
+    show = action("show", "print the board: ranks with intervals, levels, badges", _show, _SHOW)
+    confirm = action("confirm", "score an entry again, or compare a second run", _confirm, _CONFIRM)
+    register = action(
+        "register", "allow entries the names of methods that ship", _register, _REGISTER
+    )
+    build = action("build", "write the static site", _build, _BUILD)
+    for one in (add, submit, check, show, confirm, register, build):
+        one.add_argument(
             "--entries", metavar="DIR", help="folder of the entries (default leaderboard/entries)"
         )
-        return added
-
-    add = action("add", "write entries of results into the folder of entries", _ADD)
-    submit = action("submit", "make the folder of a pull request", _SUBMIT)
     for taking in (add, submit):
         taking.add_argument(
             "results", nargs="+", metavar="RESULTS", help="results folder or results.json"
@@ -133,16 +130,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     submit.add_argument("--revises", metavar="ENTRY", help="name of the entry that is corrected")
     submit.add_argument("--reason", default="", metavar="TEXT", help="why it is corrected")
-    submit.add_argument("--json", action="store_true", help="print the entries as JSON")
-    check = action("check", "check digests, protocol version, completeness of entries", _CHECK)
+    add_json(submit, "print the entries as JSON")
     check.add_argument(
         "--against", metavar="DIR", help="entries before: none may be changed or removed"
     )
-    check.add_argument("--json", action="store_true", help="print the entries as JSON")
-    show = action("show", "print the board: ranks with intervals, levels, badges", _SHOW)
+    add_json(check, "print the entries as JSON")
     show.add_argument("--suite", metavar="NAME", help="only the tables of this suite")
-    show.add_argument("--json", action="store_true", help="print the tables as JSON")
-    confirm = action("confirm", "score an entry again, or compare a second run", _CONFIRM)
+    add_json(show, "print the tables as JSON")
     confirm.add_argument("results", metavar="RESULTS", help="results folder with predictions")
     confirm.add_argument("--by", required=True, metavar="NAME", help="who checks")
     confirm.add_argument("--entry", metavar="NAME", help="entry, where several fit")
@@ -168,10 +162,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="digest (8 digits at least) of a check of the entry that no longer counts",
     )
     confirm.add_argument("--reason", default="", metavar="TEXT", help="why it does not count")
-    confirm.add_argument("--json", action="store_true", help="print the check as JSON")
-    register = action("register", "allow entries the names of methods that ship", _REGISTER)
+    add_json(confirm, "print the check as JSON")
     register.add_argument("names", nargs="+", metavar="ENTRY", help="name of an entry")
-    build = action("build", "write the static site", _BUILD)
     build.add_argument("-o", "--out", required=True, metavar="DIR", help="folder of the site")
     build.add_argument(
         "--with",
@@ -195,16 +187,8 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.base.packages import data_folder
 
     folder = Path(args.entries) if args.entries else data_folder("leaderboard") / "entries"
-    work = {
-        "add": _add,
-        "submit": _submit,
-        "show": _show,
-        "check": _check,
-        "confirm": _confirm,
-        "register": _register,
-        "build": _build,
-    }
-    return work[args.action](args, folder)
+    status: int = args.act(args, folder)
+    return status
 
 
 def _add(args: argparse.Namespace, folder: Path) -> int:
@@ -252,7 +236,7 @@ def _submit(args: argparse.Namespace, folder: Path) -> int:
 
 def _submission(args: argparse.Namespace) -> Submission:
     from hwp_bench.base.errors import UsageError
-    from hwp_bench.leaderboard.records import Submission
+    from hwp_bench.leaderboard.entries import Submission
 
     given = [("--by", args.by), ("--reason", args.reason), ("--revises", args.revises or "")]
     for option, text in [*given, *(("--link", text) for text in args.link)]:
@@ -280,8 +264,13 @@ def _check_line(option: str, text: str) -> None:
 
 def _check(args: argparse.Namespace, folder: Path) -> int:
     from hwp_bench.leaderboard.entries import read_entries
-    from hwp_bench.leaderboard.names import check_names, read_names
-    from hwp_bench.leaderboard.rules import check_complete, check_entries, check_unchanged
+    from hwp_bench.leaderboard.rules import (
+        check_complete,
+        check_entries,
+        check_names,
+        check_unchanged,
+        read_names,
+    )
     from hwp_bench.leaderboard.soundness import check_bound, check_dates
 
     _refuse_none(folder)
@@ -301,8 +290,8 @@ def _check(args: argparse.Namespace, folder: Path) -> int:
 def _show(args: argparse.Namespace, folder: Path) -> int:
     from hwp_bench.base.errors import UsageError
     from hwp_bench.base.tables import print_table, to_object
+    from hwp_bench.leaderboard.board import board_tables
     from hwp_bench.leaderboard.soundness import sound_entries
-    from hwp_bench.leaderboard.standings import board_tables
 
     _refuse_none(folder)
     entries = sound_entries(folder)
@@ -312,7 +301,7 @@ def _show(args: argparse.Namespace, folder: Path) -> int:
         raise UsageError(f"no entry is of the suite {args.suite!r}", field="--suite")
     tables = board_tables(chosen)
     if args.json:
-        print(json.dumps([to_object(table) for table in tables], indent=1))
+        print_json([to_object(table) for table in tables])
     for table in () if args.json else tables:
         print_table(table)
     return 0
@@ -323,10 +312,9 @@ def _confirm(args: argparse.Namespace, folder: Path) -> int:
 
     from hwp_bench.base.console import notice
     from hwp_bench.base.errors import UsageError
-    from hwp_bench.cli.verify import captures_of
-    from hwp_bench.leaderboard.confirm import confirm, entry_of
     from hwp_bench.leaderboard.entries import refuse_installed, write_check
     from hwp_bench.leaderboard.soundness import readable_entries
+    from hwp_bench.leaderboard.submit import confirm, entry_of
     from hwp_bench.results import read_results, result_files
 
     _check_line("--by", args.by)
@@ -350,7 +338,7 @@ def _confirm(args: argparse.Namespace, folder: Path) -> int:
     )
     notice(f"check: {write_check(folder, check)}")
     if args.json:
-        print(json.dumps(asdict(check), indent=1))
+        print_json(asdict(check))
     else:
         print(f"{check.entry}: {check.kind}, {check.verdict} ({check.frames} frames)")
         if check.rerun:
@@ -365,7 +353,7 @@ def _register(args: argparse.Namespace, folder: Path) -> int:
     from hwp_bench.base.console import notice
     from hwp_bench.base.errors import UsageError
     from hwp_bench.leaderboard.entries import refuse_installed
-    from hwp_bench.leaderboard.names import NAME, register
+    from hwp_bench.leaderboard.rules import NAME, register
     from hwp_bench.leaderboard.soundness import readable_entries
 
     refuse_installed(folder)
@@ -428,7 +416,7 @@ def _refuse_unsound(folder: Path, entries: Sequence[Entry]) -> None:
 
 def _print_entries(entries: Sequence[Entry], as_json: bool) -> None:
     if as_json:
-        print(json.dumps([_facts(entry) for entry in entries], indent=1))
+        print_json([_facts(entry) for entry in entries])
 
 
 def _facts(entry: Entry) -> dict[str, Any]:

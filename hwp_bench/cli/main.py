@@ -11,48 +11,49 @@ from hwp_bench.cli.program import Command, run_program
 def command_tree() -> Command:
     """Return every command of `hwp-bench`."""
     here = "hwp_bench.cli"
+    evaluate, results = f"{here}.evaluate", f"{here}.results"
     imports = {
-        "wildghand": Command("make captures of the official release", f"{here}.import_wildghand"),
-        "interhand26m": Command("make a capture of InterHand2.6M", f"{here}.import_interhand"),
-        "video": Command("make a capture of a video", f"{here}.import_video"),
+        "wildghand": Command("make captures of the official release", f"{here}.imports:wildghand"),
+        "interhand26m": Command("make a capture of InterHand2.6M", f"{here}.imports:interhand26m"),
+        "video": Command("make a capture of a video", f"{here}.imports:video"),
     }
     hands = {
-        "convert": Command("express hands in another hand model", f"{here}.hands_convert"),
-        "export": Command("write the hands of a frame as a mesh", f"{here}.hands_export"),
+        "convert": Command("express hands in another hand model", f"{here}.data:convert"),
+        "export": Command("write the hands of a frame as a mesh", f"{here}.data:export"),
     }
     data = {
-        "check": Command("check a capture and say what is wrong", f"{here}.data_check"),
-        "show": Command("draw a contact sheet of a capture", f"{here}.data_show"),
-        "audit": Command("check that a capture's split is fair", f"{here}.data_audit"),
-        "get": Command("download a public data set", f"{here}.data_get"),
+        "check": Command("check a capture and say what is wrong", f"{here}.data:check"),
+        "show": Command("draw a contact sheet of a capture", f"{here}.data:show"),
+        "audit": Command("check that a capture's split is fair", f"{here}.data:audit"),
+        "get": Command("download a public data set", f"{here}.data:get"),
         "import": Command("make captures of other data", commands=imports),
-        "import-video": Command("make a capture of a video", f"{here}.import_video"),
-        "track": Command("track the hands of a video", f"{here}.data_track"),
-        "inputs": Command("write the inputs of a program of your own", f"{here}.data_inputs"),
+        "import-video": Command("make a capture of a video", f"{here}.imports:video"),
+        "track": Command("track the hands of a video", f"{here}.data:track"),
+        "inputs": Command("write the inputs of a program of your own", f"{here}.data:inputs"),
         "publish": Command(
-            "divide captures into a public and a sealed part", f"{here}.data_publish"
+            "divide captures into a public and a sealed part", f"{here}.data:publish"
         ),
     }
     return Command(
         "benchmark for hand avatars from perturbed in-the-wild video",
         commands={
-            "demo": Command("simulate a capture, fit a baseline, score it", f"{here}.demo"),
-            "evaluate": Command("run a method on captures and score it", f"{here}.evaluate"),
-            "ablate": Command("measure gain and cost of components", f"{here}.ablate"),
-            "budget": Command("measure what each estimate costs a method", f"{here}.budget"),
-            "cost": Command("show accuracy against time", f"{here}.cost"),
-            "verify": Command("recompute digests and scores of results", f"{here}.verify"),
-            "compare": Command("test differences for significance", f"{here}.compare"),
-            "table": Command("print tables of results", f"{here}.table"),
-            "report": Command("write one HTML page about results", f"{here}.report"),
+            "demo": Command("simulate a capture, fit a baseline, score it", f"{evaluate}:demo"),
+            "evaluate": Command("run a method on captures and score it", f"{evaluate}:evaluate"),
+            "ablate": Command("measure gain and cost of components", f"{evaluate}:ablate"),
+            "budget": Command("measure what each estimate costs a method", f"{evaluate}:budget"),
+            "cost": Command("show accuracy against time", f"{results}:cost"),
+            "verify": Command("recompute digests and scores of results", f"{results}:verify"),
+            "compare": Command("test differences for significance", f"{results}:compare"),
+            "table": Command("print tables of results", f"{results}:table"),
+            "report": Command("write one HTML page about results", f"{results}:report"),
             "leaderboard": Command("make, check and show leaderboards", f"{here}.leaderboard"),
             "sealed": Command("make, reveal and check sealed suites", f"{here}.sealed"),
-            "list": Command("list captures, suites, methods, metrics", f"{here}.list"),
+            "list": Command("list captures, suites, methods, metrics", f"{here}.toolkit:list"),
             "data": Command("make, check and show captures", commands=data),
             "hands": Command("hand models", commands=hands),
             "sim": Command("simulate captures", f"{here}.sim"),
-            "completion": Command("print completion for a shell", f"{here}.completion"),
-            "stability": Command("run the numerical hard cases", f"{here}.stability"),
+            "completion": Command("print completion for a shell", f"{here}.toolkit:completion"),
+            "stability": Command("run the numerical hard cases", f"{here}.toolkit:stability"),
         },
     )
 

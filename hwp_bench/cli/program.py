@@ -1,4 +1,7 @@
-"""A program of commands: finds one, builds its parser, runs it, prints an error as one line."""
+"""A program of commands: finds one, builds its parser, runs it, prints an error as one line.
+
+A running program imports the module of its command alone. Completion looks at all of them.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +12,18 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeAlias
 
 from hwp_bench.base.console import in_utf8_mode, settle, standard_streams, tell
 from hwp_bench.base.errors import HwpError, check_name, nearest
 from hwp_bench.base.numerics import check_thread_variables, flushed_process, share_processors
 from hwp_bench.base.packages import __version__
+
+#: What adds the arguments of a command to its parser, and what runs it and returns the status.
+AddArguments: TypeAlias = Callable[[argparse.ArgumentParser], None]
+Run: TypeAlias = Callable[[argparse.Namespace], int]
 
 
 @dataclass(frozen=True)
@@ -25,10 +32,17 @@ class Command:
 
     #: One line for `--help`.
     summary: str
-    #: Module with `add_arguments(parser)` and `run(args)`; empty for a group.
+    #: Module with `add_arguments(parser)` and `run(args)`, or `MODULE:NAME` where it holds both in
+    #: `COMMANDS[NAME]`; empty for a group.
     module: str = ""
     #: Commands of a group, by name.
     commands: dict[str, Command] = field(default_factory=dict)
+
+    def load(self) -> tuple[AddArguments, Run]:
+        """Import what adds the arguments of the command, and what runs it."""
+        place, _, name = self.module.partition(":")
+        module = importlib.import_module(place)
+        return module.COMMANDS[name] if name else (module.add_arguments, module.run)
 
 
 #: Exit status where nobody reads standard output any more, as that of a program which SIGPIPE ends.
@@ -132,13 +146,13 @@ def _dispatch(program: str, group: Command, words: list[str]) -> int:
     command = group.commands[name]
     if command.commands:
         return _dispatch(f"{program} {name}", command, rest)
-    module = importlib.import_module(command.module)
-    leaf = argparse.ArgumentParser(**describe_leaf(f"{program} {name}", command))
-    module.add_arguments(leaf)
-    return module.run(leaf.parse_args(rest))
+    add_arguments, run = command.load()
+    leaf = argparse.ArgumentParser(**_describe_leaf(f"{program} {name}", command))
+    add_arguments(leaf)
+    return run(leaf.parse_args(rest))
 
 
-def describe_leaf(program: str, command: Command) -> dict[str, Any]:
+def _describe_leaf(program: str, command: Command) -> dict[str, Any]:
     """Return the keyword arguments of a command's parser."""
     return {
         "prog": program,
@@ -147,7 +161,7 @@ def describe_leaf(program: str, command: Command) -> dict[str, Any]:
     }
 
 
-def describe_group(program: str, group: Command) -> dict[str, Any]:
+def _describe_group(program: str, group: Command) -> dict[str, Any]:
     """Return the keyword arguments of the parser of a group of commands."""
     width = max(len(name) for name in group.commands)
     lines = [f"  {name:<{width}}  {item.summary}" for name, item in group.commands.items()]
@@ -162,6 +176,77 @@ def describe_group(program: str, group: Command) -> dict[str, Any]:
 
 
 def _group_parser(program: str, group: Command) -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(**describe_group(program, group))
+    parser = argparse.ArgumentParser(**_describe_group(program, group))
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     return parser
+
+
+# Values of these types are not names of files.
+_NUMBERS = (int, float)
+
+
+def whole_parser(program: str, tree: Command) -> argparse.ArgumentParser:
+    """Return one parser with every command; a running program builds only the one it needs."""
+    parser = argparse.ArgumentParser(**_describe_group(program, tree))
+    _fill(parser, program, tree)
+    return parser
+
+
+#: Shells that there is a script for.
+SHELLS = ("bash", "zsh", "fish")
+
+_COMPLETION_EXAMPLES = """examples:
+  source <({program} completion bash)                              # in this shell
+  {program} completion bash >> ~/.local/share/bash-completion/completions/{program}
+  {program} completion zsh > ~/.zfunc/_{program}                   # with ~/.zfunc in fpath
+  {program} completion fish > ~/.config/fish/completions/{program}.fish
+
+The script holds every command and option of this version; print it again after an update.
+"""
+
+
+def add_shell_argument(parser: argparse.ArgumentParser, program: str) -> None:
+    """Add the arguments of the command to a program's parser."""
+    parser.epilog = _COMPLETION_EXAMPLES.replace("{program}", program)
+    parser.add_argument("shell", choices=SHELLS, metavar="SHELL", help=f"{', '.join(SHELLS)}")
+
+
+def completion_script(program: str, tree: Command, shell: str) -> str:
+    """Return the script that completes a program's command line in a shell.
+
+    Args:
+        program: its name.
+        tree: its commands.
+        shell: one of `SHELLS`.
+    """
+    import shtab
+
+    parser = whole_parser(program, tree)
+    _complete_files(parser)
+    return shtab.complete(parser, shell=shell)
+
+
+def _fill(parser: argparse.ArgumentParser, program: str, group: Command) -> None:
+    actions = parser.add_subparsers(dest="command", metavar="COMMAND", help="what to do")
+    for name, command in group.commands.items():
+        if command.commands:
+            described = _describe_group(f"{program} {name}", command)
+            below = actions.add_parser(name, help=command.summary, **described)
+            _fill(below, f"{program} {name}", command)
+            continue
+        leaf = actions.add_parser(
+            name, help=command.summary, **_describe_leaf(f"{program} {name}", command)
+        )
+        command.load()[0](leaf)
+
+
+def _complete_files(parser: argparse.ArgumentParser) -> None:
+    """Let the values of arguments be completed as files, as a shell does by itself."""
+    import shtab
+
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for below in action.choices.values():
+                _complete_files(below)
+        elif action.nargs != 0 and not action.choices and action.type not in _NUMBERS:
+            action.complete = shtab.FILE  # type: ignore[attr-defined]

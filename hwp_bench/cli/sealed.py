@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from hwp_bench.cli.options import add_actions, add_json, print_json
 from hwp_bench.run.engine.options import add_engine_arguments
 from hwp_bench.taxonomy import SUITES
 
@@ -53,20 +53,10 @@ by how many levels).
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.epilog = _EXAMPLES
-    actions = parser.add_subparsers(
-        dest="action", required=True, metavar="ACTION", help="what to do"
+    action = add_actions(parser)
+    make = action(
+        "make", "draw a secret, render a suite from it, divide it into parts", _make, _MAKE
     )
-
-    def action(name: str, text: str, epilog: str) -> argparse.ArgumentParser:
-        return actions.add_parser(
-            name,
-            help=text,
-            description=text[0].upper() + text[1:] + ".",
-            epilog=epilog,
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
-
-    make = action("make", "draw a secret, render a suite from it, divide it into parts", _MAKE)
     make.add_argument("scenes", nargs="*", metavar="SCENE", help="scenes that come along")
     make.add_argument("--suite", choices=SUITES, help="the scenes, frames and size of a suite")
     make.add_argument("-o", "--out", required=True, metavar="DIR", help="folder of the suite")
@@ -74,12 +64,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     make.add_argument("--size", type=int, help="edge of the images in pixels (default 176)")
     make.add_argument("--secret", metavar="FILE", help="file of a secret (default: draw one)")
     make.add_argument("--workers", type=int, help="processes (default: as many as are worth it)")
-    make.add_argument("--json", action="store_true", help="print what was made as JSON")
+    add_json(make, "print what was made as JSON")
     add_engine_arguments(make)
-    reveal = action("reveal", "write the file that reveals a suite's secret", _REVEAL)
+    reveal = action("reveal", "write the file that reveals a suite's secret", _reveal, _REVEAL)
     reveal.add_argument("suite", metavar="SUITE", help="folder that `make` made")
     reveal.add_argument("-o", "--out", required=True, metavar="FILE", help="file to write")
-    check = action("check", "make the captures of a revealed suite again and compare", _CHECK)
+    check = action(
+        "check", "make the captures of a revealed suite again and compare", _check, _CHECK
+    )
     check.add_argument("public", metavar="PUBLIC", help="the published part for authors")
     check.add_argument("revealed", metavar="REVEALED", help="the file that reveals the secret")
     check.add_argument(
@@ -95,12 +87,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     which.add_argument("--no-render", action="store_true", help="compare the commitments alone")
     check.add_argument("--workers", type=int, help="processes (default: as many as are worth it)")
-    check.add_argument("--json", action="store_true", help="print what was compared as JSON")
+    add_json(check, "print what was compared as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
-    return {"make": _make, "reveal": _reveal, "check": _check}[args.action](args)
+    status: int = args.act(args)
+    return status
 
 
 def _make(args: argparse.Namespace) -> int:
@@ -129,7 +122,7 @@ def _make(args: argparse.Namespace) -> int:
         "commitment to the frames": made.page.frames_commitment,
     }
     if args.json:
-        print(json.dumps({name.replace(" ", "_"): text for name, text in lines.items()}, indent=1))
+        print_json({name.replace(" ", "_"): text for name, text in lines.items()})
     else:
         print("\n".join(f"{name}: {text}" for name, text in lines.items()))
     return 0
@@ -170,7 +163,7 @@ def _check(args: argparse.Namespace) -> int:
     if args.json:
         rows = [{**asdict(capture), "same": capture.same} for capture in found.captures]
         page = {"secret_commitment": found.page.secret_commitment, "holds": found.holds}
-        print(json.dumps({**page, "captures": rows}, indent=1))
+        print_json({**page, "captures": rows})
         return 0 if found.holds else 1
     print(f"the secret is the one that was committed to: {found.page.secret_commitment}")
     for capture in found.captures:

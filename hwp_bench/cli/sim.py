@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 
+from hwp_bench.cli.options import add_actions, add_json
 from hwp_bench.run.engine.options import add_engine_arguments
 from hwp_bench.taxonomy import SUITES
 
@@ -26,15 +27,7 @@ wild-dev-3, or the path of a scene file. `all` are the eleven captures, wild-dev
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.epilog = _EXAMPLES
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    actions = parser.add_subparsers(
-        dest="action", required=True, metavar="ACTION", help="what to do"
-    )
-
-    def action(name: str, text: str) -> argparse.ArgumentParser:
-        described = text[0].upper() + text[1:] + "."
-        return actions.add_parser(name, help=text, description=described)
-
+    action = add_actions(parser)
     _add_list(action("list", "list scenes, suites, objects and effects"))
     _add_plan(action("plan", "print what a scene's frames need and will cost"))
     _add_render(action("render", "render captures"))
@@ -59,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _add_list(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--json", action="store_true", help="print JSON")
+    add_json(parser)
 
 
 def _add_plan(parser: argparse.ArgumentParser) -> None:
@@ -70,7 +63,7 @@ def _add_plan(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--no-probe", action="store_true", help="count passes only, render no probe for the cost"
     )
-    parser.add_argument("--json", action="store_true", help="print JSON")
+    add_json(parser)
 
 
 def _add_render(parser: argparse.ArgumentParser) -> None:
@@ -117,7 +110,7 @@ def _add_calibrate(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--effect", metavar="KIND", help="only this effect")
     parser.add_argument("--write", action="store_true", help="write strengths into the files")
-    parser.add_argument("--json", action="store_true", help="print JSON")
+    add_json(parser)
 
 
 def _add_extent(parser: argparse.ArgumentParser) -> None:

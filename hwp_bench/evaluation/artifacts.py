@@ -9,50 +9,54 @@ from pathlib import Path
 
 import numpy as np
 
+from hwp_bench.base.arrays import evenly
 from hwp_bench.base.drawing import error_map, fitted, labelled, sheet
 from hwp_bench.base.files import atomic_write
 from hwp_bench.base.folders import remove_tree
 from hwp_bench.base.images import write_image
 from hwp_bench.capture import Capture
 from hwp_bench.capture.schema import frame_name
-from hwp_bench.evaluation.scoring import MAX_PREDICTION_BYTES, Prediction
-from hwp_bench.metrics.pixels import scored_pixels
-from hwp_bench.metrics.protocol import HWP_V1
-from hwp_bench.results import FrameResult
-from hwp_bench.run.output import DIAGNOSTICS, LOG
+from hwp_bench.evaluation.scoring import (
+    MAX_PREDICTION_BYTES,
+    ScoredFrames,
+    read_prediction,
+    read_targets,
+)
+from hwp_bench.report.sources import ResultsSource
+from hwp_bench.results import CaptureResult, FrameResult
 from hwp_bench.run.sandbox.supervise import MAX_LOG_BYTES
+from hwp_bench.run.worker import DIAGNOSTICS, LOG
 
 #: Most bytes of temporal weights and weight masks that are kept of a capture.
 MAX_DIAGNOSTICS = 64 << 20
 #: Larger side of a tile, px.
 EDGE = 256
+#: Folder of the predicted frames inside the result folder of a capture.
+FREE_PREDICTIONS = "free"
+#: The picture of some of them, with the other pictures of a capture.
+FREE_PICTURE = "free_view.png"
+#: Views that the picture shows, and the larger edge of each, px.
+FREE_VIEWS, FREE_EDGE = 6, 176
 
 
 def keep_artifacts(
-    folder: Path,
-    output: Path,
-    source: Path,
-    capture: Capture,
-    scores: Sequence[FrameResult],
-    predictions: Sequence[Prediction],
+    folder: Path, output: Path, frames: ScoredFrames, free_view: ScoredFrames | None
 ) -> None:
-    """Keep predictions, log and diagnostics of a run, and draw images; drop the rest of the run.
+    """Keep what a run left (predictions, log, diagnostics) in the folder of a capture's result.
 
-    Args:
-        folder: the result folder of the capture.
-        output: output folder of the run, which is removed.
-        source: folder of the predicted frames.
-        capture: the capture.
-        scores: the scores of the test frames.
-        predictions: their predictions, in the same order.
+    Draws pictures of it, and drops the rest of the run.
     """
-    keep_predictions(folder / "predictions", source, [item.frame for item in predictions])
+    for scored, name in ((frames, "predictions"), (free_view, FREE_PREDICTIONS)):
+        if scored is not None:
+            keep_predictions(folder / name, scored.source, [one.frame for one in scored.targets])
     if (output / LOG).is_file():
         keep_log(output / LOG, folder / LOG)
     keep_diagnostics(output / DIAGNOSTICS, folder / DIAGNOSTICS)
     remove_tree(output)
-    if any(frame.failure is None for frame in scores):
-        write_pictures(folder / "pictures", capture, scores, predictions)
+    if any(frame.failure is None for frame in frames.scores):
+        write_pictures(folder / "pictures", frames)
+    if free_view is not None:
+        write_image(folder / "pictures" / FREE_PICTURE, free_view_picture(free_view))
 
 
 def keep_log(source: Path, target: Path) -> None:
@@ -98,52 +102,39 @@ def keep_diagnostics(source: Path, target: Path) -> None:
         shutil.copyfile(path, kept)
 
 
-def write_pictures(
-    folder: Path,
-    capture: Capture,
-    frames: Sequence[FrameResult],
-    predictions: Sequence[Prediction],
-) -> Path:
-    """Write `worst.png`, `median.png`, `best.png` and one sheet of the three.
+def write_pictures(folder: Path, scored: ScoredFrames) -> None:
+    """Write `worst.png`, `median.png`, `best.png` and one sheet of the three, `comparison.png`.
 
-    Args:
-        folder: where to.
-        capture: the capture.
-        frames: the scores of the test frames.
-        predictions: their predictions, in the same order.
-
-    Returns:
-        The sheet, `comparison.png`: a row a frame; truth in full, then truth, prediction and
-        error on the scored pixels.
+    A row a frame: truth in full, then truth, prediction and error on the scored pixels.
     """
     tiles = []
-    for name, position in telling_frames(frames).items():
-        row = _row(name, capture, frames[position], predictions[position])
+    for name, place in find_extreme_frames(scored.scores).items():
+        target = scored.targets[place]
+        pixels, label = _prediction(scored, place)
+        wrong = error_map(pixels, target.pixels, target.region)
+        row = [
+            labelled(fitted(image, EDGE), text)
+            for image, text in (
+                (target.pixels, f"{name}: frame {target.frame}"),
+                (target.masked(target.pixels), "truth, scored pixels"),
+                (target.masked(pixels), f"prediction, {label}"),
+                (wrong, "error (yellow: 64 levels)"),
+            )
+        ]
         write_image(folder / f"{name}.png", sheet(row, columns=len(row)))
         tiles += row
-    return write_image(folder / "comparison.png", sheet(tiles, columns=4))
+    write_image(folder / "comparison.png", sheet(tiles, columns=4))
 
 
-def _row(
-    name: str, capture: Capture, result: FrameResult, prediction: Prediction
-) -> list[np.ndarray]:
-    target = capture.frame(result.frame)
-    mask, exact = capture.scoring_mask(result.frame)
-    region = scored_pixels(mask, erosion=HWP_V1.mask_erosion, coverage=exact)
-    if prediction.pixels is None:
-        pixels, label = np.zeros_like(target), "no prediction"
-    else:
-        pixels, label = prediction.pixels, f"PSNR {result.scores['psnr']:.2f} dB"
-    inside = region[:, :, None]
-    return [
-        labelled(fitted(target, EDGE), f"{name}: frame {result.frame}"),
-        labelled(fitted(np.where(inside, target, 0), EDGE), "truth, scored pixels"),
-        labelled(fitted(np.where(inside, pixels, 0), EDGE), f"prediction, {label}"),
-        labelled(fitted(error_map(pixels, target, region), EDGE), "error (yellow: 64 levels)"),
-    ]
+def _prediction(scored: ScoredFrames, place: int) -> tuple[np.ndarray, str]:
+    """A predicted image (H, W, 3), black where there is none, and what its tile says."""
+    pixels = scored.predictions[place].pixels
+    if pixels is None:
+        return np.zeros_like(scored.targets[place].pixels), "no prediction"
+    return pixels, f"PSNR {scored.scores[place].scores['psnr']:.2f} dB"
 
 
-def telling_frames(frames: Sequence[FrameResult], metric: str = "psnr") -> dict[str, int]:
+def find_extreme_frames(frames: Sequence[FrameResult], metric: str = "psnr") -> dict[str, int]:
     """Return the positions of the worst, median and best frame in a list of results."""
     order = np.argsort([frame.scores[metric] for frame in frames], kind="stable")
     return {
@@ -151,3 +142,64 @@ def telling_frames(frames: Sequence[FrameResult], metric: str = "psnr") -> dict[
         "median": int(order[len(order) // 2]),
         "best": int(order[-1]),
     }
+
+
+def free_view_picture(scored: ScoredFrames) -> np.ndarray:
+    """Draw views spread over the clip, the truth above the prediction, on the scored pixels.
+
+    (H, W, 3) uint8: a column a view.
+    """
+    truths, drawn = [], []
+    for place in evenly(len(scored.targets), FREE_VIEWS).tolist():
+        target = scored.targets[place]
+        pixels, label = _prediction(scored, place)
+        truth = fitted(target.masked(target.pixels), FREE_EDGE)
+        truths.append(labelled(truth, f"truth, frame {target.frame}"))
+        drawn.append(labelled(fitted(target.masked(pixels), FREE_EDGE), label))
+    return sheet([*truths, *drawn], columns=len(truths))
+
+
+def write_side_by_side(
+    path: Path, sources: Sequence[ResultsSource], captures: Sequence[Capture]
+) -> Path:
+    """Draw a row for each capture: its truth and every method, on the scored pixels.
+
+    The frame is that of the median score, in the mean over the methods: nobody chooses it.
+    """
+    tiles = []
+    for capture in captures:
+        name = capture.info.id
+        found = [next(one for one in s.results.captures if one.id == name) for s in sources]
+        frame = _typical_frame(found)
+        [target] = read_targets(capture, [frame])
+        images: list[tuple[np.ndarray | None, str]] = [
+            (target.pixels, f"truth: {name}, frame {frame}")
+        ]
+        for source, result in zip(sources, found, strict=True):
+            folder = source.place(result.id, "predictions")
+            pixels = read_prediction(folder, frame, capture.size).pixels if folder else None
+            psnr = next(item.scores["psnr"] for item in result.frames if item.frame == frame)
+            images.append((pixels, f"{source.results.method.title}, {psnr:.1f} dB"))
+        box = square_around(target.region)
+        tiles += [labelled(fitted(target.masked(image)[box], EDGE), text) for image, text in images]
+    return write_image(path, sheet(tiles, columns=1 + len(sources)))
+
+
+def _typical_frame(found: Sequence[CaptureResult]) -> int:
+    """The frame of the median score, in the mean over the methods."""
+    scores = np.mean([[frame.scores["psnr"] for frame in one.frames] for one in found], axis=0)
+    order = np.argsort(scores, kind="stable")
+    return found[0].frames[int(order[len(order) // 2])].frame
+
+
+def square_around(region: np.ndarray) -> tuple[slice, slice]:
+    """The smallest square window around some pixels, or as much of it as the image has."""
+    rows, columns = (np.nonzero(region.any(axis=axis))[0] for axis in (1, 0))
+    if not len(rows):
+        return slice(None), slice(None)
+    edge = max(np.ptp(rows), np.ptp(columns)) + 1
+    windows = []
+    for places, size in zip((rows, columns), region.shape, strict=True):
+        start = max(0, min((places[0] + places[-1] + 1 - edge) // 2, size - edge))
+        windows.append(slice(int(start), int(start + edge)))
+    return windows[0], windows[1]

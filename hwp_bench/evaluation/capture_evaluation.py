@@ -1,15 +1,20 @@
-"""Evaluate one method on one capture: run it, score its predictions, store the result."""
+"""The key of an evaluation: one digest of everything that decides its scores.
+
+A stored result of the same key is taken as it is. The key also binds a result: whoever changes the
+name, settings, seed or budget of a result by hand leaves a key that is not of its content.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from hwp_bench.base.errors import BadMethod, HwpError, MethodFailed, bounded, one_line, shown
-from hwp_bench.base.files import disc_errors, read_json, write_json
+from hwp_bench.base.files import disc_errors, read_json, sha256_json, write_json
 from hwp_bench.base.folders import remove_tree, scratch_folder
 from hwp_bench.base.packages import PACKAGES
 from hwp_bench.base.records import MAX_TEXT, parse_record
@@ -18,40 +23,97 @@ from hwp_bench.capture.check import refuse_changed
 from hwp_bench.capture.schema import EXTRA, IMAGE_FOLDERS
 from hwp_bench.capture.splits import Split
 from hwp_bench.evaluation.artifacts import keep_artifacts
-from hwp_bench.evaluation.colour_check import colour_warnings, keep_warnings
-from hwp_bench.evaluation.evaluation_key import evaluation_key
-from hwp_bench.evaluation.free_view import keep_free_view, read_free_targets, score_free_view
 from hwp_bench.evaluation.scoring import (
+    WARNINGS,
+    colour_warnings,
     mean_scores,
-    predictions_digest,
     read_prediction,
-    read_predictions,
     read_targets,
-    score_predictions,
+    score_frames_of,
 )
-from hwp_bench.methods.contents import (
-    digest_of,
-    exposed_digest,
-    left_out_folders,
-    method_files,
-)
+from hwp_bench.methods.contents import digest_of, exposed_digest, left_out_folders, method_files
 from hwp_bench.methods.contract import FRAME_CHOICES, RunSettings
-from hwp_bench.methods.manifest import MethodManifest, read_manifest
+from hwp_bench.methods.manifest import MethodManifest, read_manifest, ships
 from hwp_bench.methods.request import write_request
-from hwp_bench.methods.setting_files import ships
-from hwp_bench.metrics import PROTOCOLS
+from hwp_bench.metrics import METRICS, PROTOCOLS
 from hwp_bench.metrics.lpips import load_available
 from hwp_bench.metrics.score import Network
-from hwp_bench.results import CaptureResult, CurvePoint
-from hwp_bench.results.walls import WALLED
+from hwp_bench.results import CaptureResult, CurvePoint, FreeViewResult, Results
+from hwp_bench.results.schema import ISOLATED
 from hwp_bench.run.engine import Folder, Job, Needs
-from hwp_bench.run.engine.job import OnProgress, ignore
-from hwp_bench.run.output import LOG, RunFacts, checkpoint_folder
+from hwp_bench.run.engine.job import OnProgress, ignore_progress
 from hwp_bench.run.runner import DEFAULT_TIME_LIMIT, RunRecord, run_method
 from hwp_bench.run.sandbox.confinement import Confinement, hand_model_files
+from hwp_bench.run.worker import LOG, RunFacts, checkpoint_folder
 
+#: Version of the evaluation itself; a stored result of another version is not taken.
+RECIPE = 1
 #: The result of one capture, inside its folder.
 RESULT = "result.json"
+
+
+@dataclass(frozen=True)
+class EvaluationKey:
+    """Everything that decides the scores of a capture.
+
+    A stored result of the same key is taken as it is. The key also binds a result: whoever changes
+    the name, settings, seed or budget of a result by hand leaves a key that is not of its content.
+    """
+
+    #: Name and digest of the method.
+    method: tuple[str, str]
+    #: Digest of the capture, and of its split.
+    capture: str
+    split: str
+    #: The preset with its overrides.
+    settings: Mapping[str, Any]
+    #: Seed of everything random.
+    seed: int
+    #: `seconds` and `steps`, either may be None.
+    budget: Mapping[str, float | None]
+    #: The training frames that the method is given.
+    frames: str
+    #: Settings of the protocols that are scored.
+    protocols: Sequence[Mapping[str, Any]]
+    #: Backbones of LPIPS that are scored, sorted.
+    networks: Sequence[str]
+    #: Digest of further files that the method is shown; None where there are none.
+    exposed: str | None
+    #: Digest of the free-view clip; None where there is none.
+    free_view: str | None
+    #: Version of the evaluation.
+    recipe: int = RECIPE
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 (hex) of all of it."""
+        content = {**vars(self), "settings": dict(self.settings), "budget": dict(self.budget)}
+        # What was added later does not change the keys of captures that have none of it.
+        for name in ("exposed", "free_view"):
+            if content[name] is None:
+                del content[name]
+        return sha256_json(content)
+
+
+def key_of(results: Results, capture: CaptureResult, clip: str | None) -> str:
+    """Return the key of one capture of a result, from the result's other fields.
+
+    `clip` is the digest of the capture's free-view clip; None where it has none.
+    """
+    scored = {name for frame in capture.frames for name in frame.scores}
+    return EvaluationKey(
+        method=(results.method.name, results.method.digest),
+        capture=capture.digest,
+        split=capture.split_digest,
+        settings=results.method.settings,
+        seed=results.seed,
+        budget=results.budget,
+        frames=results.frames,
+        protocols=list(results.protocols.values()),
+        networks=sorted({one.weights for one in METRICS if one.weights and one.name in scored}),
+        exposed=capture.exposed,
+        free_view=clip,
+    ).digest
 
 
 @dataclass(frozen=True)
@@ -76,12 +138,6 @@ class CaptureEvaluation:
     method_files: Mapping[str, str] | None = None
 
     @property
-    def method_digest(self) -> str:
-        """Digest (hex) of the method."""
-        planned = self.method_files
-        return self.manifest.digest if planned is None else digest_of(planned)
-
-    @property
     def exposed(self) -> str | None:
         """Digest (hex) of the files that the method is shown next to its request, if any."""
         exposed = self.confinement.exposed
@@ -90,9 +146,10 @@ class CaptureEvaluation:
     @property
     def key(self) -> str:
         """Digest (hex) of everything that decides the scores."""
-        clip = self.capture.free_view
-        return evaluation_key(
-            method=(self.manifest.name, self.method_digest),
+        planned, clip = self.method_files, self.capture.free_view
+        method = self.manifest.digest if planned is None else digest_of(planned)
+        return EvaluationKey(
+            method=(self.manifest.name, method),
             capture=self.capture.digest,
             split=self.split.digest,
             settings=self.run.settings,
@@ -100,31 +157,86 @@ class CaptureEvaluation:
             budget=asdict(self.run.budget),
             frames=self.run.frames,
             protocols=[protocol.as_dict() for protocol in PROTOCOLS],
-            networks=self.networks,
+            networks=sorted(self.networks),
             exposed=self.exposed,
             free_view=None if clip is None else clip.digest,
+        ).digest
+
+    def hiding(self, folder: Path) -> CaptureEvaluation:
+        """Return the same where the method does not see a results folder, with its test frames."""
+        hidden = (*self.confinement.hidden, folder.absolute())
+        return replace(self, confinement=replace(self.confinement, hidden=hidden))
+
+    def job(self, folder: Path, text: str, needs: Needs) -> Job:
+        """Return it as a job of an engine, which shows the text; its result goes to the folder.
+
+        Another process or machine opens method and capture itself.
+        """
+        root = self.manifest.root.resolve()
+        shipped = root.relative_to(PACKAGES).as_posix() if root.is_relative_to(PACKAGES) else None
+        inputs = {"capture": Folder(self.capture.root, (EXTRA,))}
+        if shipped is None:
+            inputs["method"] = Folder(root)
+        same = {name: getattr(self, name) for name in ("split", "run", "time_limit", "confinement")}
+        return Job(
+            text=text,
+            here=partial(evaluate_capture, self, folder),
+            work=partial(evaluate_elsewhere, same, sorted(self.networks), shipped, self.key),
+            output=folder,
+            finished=lambda: stored_result(self, folder) is not None,
+            inputs=inputs,
+            needs=needs,
         )
 
 
-def evaluate_capture(
-    evaluation: CaptureEvaluation, folder: Path, on_progress: OnProgress = ignore
-) -> CaptureResult:
-    """Run a method on a capture and score it; a stored result of the same key is taken as it is.
+def evaluate_elsewhere(
+    same: Mapping[str, Any],
+    networks: Sequence[str],
+    shipped: str | None,
+    key: str,
+    inputs: Mapping[str, Path],
+    output: Path,
+    on_progress: OnProgress,
+) -> None:
+    """Do an evaluation in another process or on another machine; see `engine.job.Work`.
 
     Args:
-        evaluation: the method, the capture and the settings.
-        folder: where result, predictions, images and log go.
-        on_progress: called with (done, total) steps of the fit.
-
-    Returns:
-        The result, which `folder/result.json` then holds. A method that fails gives a result
-        with the reason and penalties, not an error.
-
-    Raises:
-        BadCapture, BadImage: the capture itself is damaged, or was changed after it was written.
-        BadMethod: files of the method changed while it ran.
-        HwpError: `folder` cannot be written to.
+        same: the fields of the evaluation that are as they were where it was ordered.
+        networks: backbones of LPIPS that are scored.
+        shipped: place of a method that ships with the toolkit; None where the method is sent.
+        key: of the evaluation where it was ordered; it must be the same here.
+        inputs: the capture, and the method where it is sent.
+        output: folder of the result.
+        on_progress: is told (done, total) steps.
     """
+    known = load_available() if networks else {}
+    missing = [name for name in networks if name not in known]
+    if missing:
+        raise HwpError(
+            f"the weights of LPIPS ({', '.join(missing)}) are not on this machine",
+            remedy="Put them on every node, or on none.",
+        )
+    manifest = read_manifest(inputs["method"] if shipped is None else PACKAGES / shipped)
+    evaluation = CaptureEvaluation(
+        manifest,
+        open_capture(inputs["capture"]),
+        networks={name: known[name] for name in networks},
+        method_files=method_files(manifest.root),
+        **same,
+    )
+    if evaluation.key != key:
+        raise HwpError(
+            "method, capture or protocols are different on this machine",
+            where=evaluation.capture.info.id,
+            remedy="Install the same version everywhere, and change nothing while jobs run.",
+        )
+    evaluate_capture(evaluation, output, on_progress)
+
+
+def evaluate_capture(
+    evaluation: CaptureEvaluation, folder: Path, on_progress: OnProgress = ignore_progress
+) -> CaptureResult:
+    """Run a method on a capture and score it; a stored result of the same key is taken as it is."""
     stored = stored_result(evaluation, folder)
     if stored is not None:
         return stored
@@ -137,8 +249,9 @@ def _evaluate(
 ) -> CaptureResult:
     """Run and score, with no regard to a stored result; see `evaluate_capture`."""
     began = time.perf_counter()
-    targets = read_targets(evaluation.capture, evaluation.split.test.tolist())
-    free_targets = read_free_targets(evaluation.capture)
+    capture, clip = evaluation.capture, evaluation.capture.free_view
+    targets = read_targets(capture, evaluation.split.test.tolist())
+    free_targets = [] if clip is None else read_targets(clip, range(len(clip)))
     _refuse_changed(evaluation)
     remove_tree(folder)
     folder.mkdir(parents=True)
@@ -146,55 +259,52 @@ def _evaluate(
     record, failure = _run(evaluation, output, on_progress)
     _refuse_edited(evaluation)
     started = time.perf_counter()
-    frames = [target.frame for target in targets]
-    source = record.predictions if record else output / "none"
-    predictions = read_predictions(source, frames, evaluation.capture.size)
-    scores = score_predictions(targets, predictions, evaluation.networks)
+    # A run that failed left nothing that would be scored.
+    record = record or RunRecord(output / "none", RunFacts(), 0.0, free_view=output / "none")
+    scored = score_frames_of(targets, record.predictions, capture.size, evaluation.networks)
     score_seconds = time.perf_counter() - started
-    offered = record.free_view if record else output / "none"
-    free = score_free_view(evaluation.capture, free_targets, offered, evaluation.networks)
-    facts = record.facts if record else RunFacts()
+    free = None
+    # Of a submission without views of the clip nothing is scored there.
+    if clip is not None and record.free_view is not None:
+        free = score_frames_of(free_targets, record.free_view, clip.size, evaluation.networks)
+    facts = record.facts
     result = CaptureResult(
-        id=evaluation.capture.info.id,
-        digest=evaluation.capture.digest,
-        hands=evaluation.capture.info.hands,
-        perturbations=list(evaluation.capture.info.perturbations),
+        id=capture.info.id,
+        digest=capture.digest,
+        hands=capture.info.hands,
+        perturbations=list(capture.info.perturbations),
         split_digest=evaluation.split.digest,
         exact_masks=all(target.exact for target in targets),
         key=evaluation.key,
-        frames=scores,
+        frames=scored.scores,
         failure=None if failure is None else shown(failure)[:MAX_TEXT],
-        predictions_digest=predictions_digest(predictions),
+        predictions_digest=scored.digest,
         fit_seconds=facts.fit_seconds,
         render_seconds=facts.render_seconds,
         score_seconds=score_seconds,
-        wall_seconds=record.wall_seconds if record else 0.0,
+        wall_seconds=record.wall_seconds,
         steps=facts.steps,
         peak_memory=facts.peak_memory,
         device=one_line(facts.device, 100) if facts.device else None,
         curve=_curve(evaluation, output, facts),
         curve_seconds=facts.curve_seconds,
         cpu_seconds=facts.cpu_seconds,
-        isolation=one_line(record.isolation) if record and record.isolation else None,
-        free_view=free.result if free else None,
-        made_by=evaluation.capture.info.made_by,
+        isolation=one_line(record.isolation) if record.isolation else None,
+        free_view=FreeViewResult(clip.digest, free.scores, free.digest) if clip and free else None,
+        made_by=capture.info.made_by,
         exposed=evaluation.exposed,
     )
-    if free is not None:
-        keep_free_view(folder, free)
-    keep_warnings(folder, colour_warnings(targets, predictions))
-    keep_artifacts(folder, output, source, evaluation.capture, scores, predictions)
+    warnings = colour_warnings(targets, scored.predictions)
+    if warnings:
+        write_json(folder / WARNINGS, warnings)
+    keep_artifacts(folder, output, scored, free)
     result = replace(result, job_seconds=time.perf_counter() - began)
     write_json(folder / RESULT, asdict(result))
     return result
 
 
 def _refuse_edited(evaluation: CaptureEvaluation) -> None:
-    """Refuse to score a run of a method whose files are not those that it began with.
-
-    Raises:
-        BadMethod: files were changed, added or removed since the evaluation was planned.
-    """
+    """Refuse to score a run of a method whose files are not those that it began with."""
     planned = evaluation.method_files
     if planned is None:
         return
@@ -211,11 +321,7 @@ def _refuse_edited(evaluation: CaptureEvaluation) -> None:
 
 
 def _refuse_changed(evaluation: CaptureEvaluation) -> None:
-    """Refuse a capture, or a clip in it, whose content is not that of the digests.
-
-    Raises:
-        BadCapture, BadImage: as `hwp_bench.capture.check.refuse_changed`.
-    """
+    """Refuse a capture, or a clip in it, whose content is not that of the digests."""
     clean = evaluation.run.frames != FRAME_CHOICES[0]
     for capture in (evaluation.capture, evaluation.capture.free_view):
         if capture is None:
@@ -239,17 +345,13 @@ def stored_result(evaluation: CaptureEvaluation, folder: Path) -> CaptureResult 
         result = read_result(folder)
     except HwpError:
         return None
-    if evaluation.confinement.mode == "required" and result.isolation != WALLED:
+    if evaluation.confinement.mode == "required" and result.isolation != ISOLATED:
         return None
     return result if result.key == evaluation.key and result.failure is None else None
 
 
 def read_result(folder: Path) -> CaptureResult:
-    """Read the result that `evaluate_capture` left in a folder.
-
-    Raises:
-        BadInput, BadResult: it is missing or damaged.
-    """
+    """Read the result that `evaluate_capture` left in a folder."""
     path = folder / RESULT
     return parse_record(CaptureResult, read_json(path), where=str(path))
 
@@ -335,94 +437,6 @@ def _curve(evaluation: CaptureEvaluation, output: Path, facts: RunFacts) -> list
     targets = read_targets(evaluation.capture, frames)
     curve = []
     for index, checkpoint in enumerate(facts.checkpoints):
-        folder = checkpoint_folder(output, index)
-        predictions = read_predictions(folder, frames, evaluation.capture.size)
-        scores = mean_scores(score_predictions(targets, predictions))
-        curve.append(CurvePoint(**asdict(checkpoint), scores=scores))
+        drawn = score_frames_of(targets, checkpoint_folder(output, index), evaluation.capture.size)
+        curve.append(CurvePoint(**asdict(checkpoint), scores=mean_scores(drawn.scores)))
     return curve
-
-
-def evaluation_job(evaluation: CaptureEvaluation, folder: Path, text: str, needs: Needs) -> Job:
-    """Return an evaluation as a job of an engine.
-
-    Args:
-        evaluation: the evaluation.
-        folder: where its result goes.
-        text: what a person is shown.
-        needs: the share of a machine that it takes.
-    """
-    root = evaluation.manifest.root.resolve()
-    shipped = root.relative_to(PACKAGES).as_posix() if root.is_relative_to(PACKAGES) else None
-    inputs = {"capture": Folder(evaluation.capture.root, (EXTRA,))}
-    if shipped is None:
-        inputs["method"] = Folder(root)
-    return Job(
-        text=text,
-        here=partial(evaluate_capture, evaluation, folder),
-        work=EvaluateElsewhere(
-            evaluation.split,
-            evaluation.run,
-            evaluation.time_limit,
-            evaluation.confinement,
-            tuple(sorted(evaluation.networks)),
-            shipped,
-            evaluation.key,
-        ),
-        output=folder,
-        finished=lambda: stored_result(evaluation, folder) is not None,
-        inputs=inputs,
-        needs=needs,
-    )
-
-
-@dataclass(frozen=True)
-class EvaluateElsewhere:
-    """An evaluation on its way to another process or machine, which opens method and capture."""
-
-    #: The split of the capture.
-    split: Split
-    #: Settings, seed, budget and training frames.
-    run: RunSettings
-    #: Seconds after which the method is killed.
-    time_limit: float
-    #: How the method's process is confined.
-    confinement: Confinement
-    #: Backbones of LPIPS that are scored.
-    networks: tuple[str, ...]
-    #: Place of a method that ships with the toolkit; None where the method is sent.
-    shipped: str | None
-    #: Key of the evaluation where it was ordered; it must be the same here.
-    key: str
-
-    def __call__(self, inputs: Mapping[str, Path], output: Path, on_progress: OnProgress) -> None:
-        """Evaluate; see `hwp_bench.run.engine.job.Work`.
-
-        Raises:
-            HwpError: method, capture, weights or protocols differ here.
-        """
-        known = load_available() if self.networks else {}
-        missing = [name for name in self.networks if name not in known]
-        if missing:
-            raise HwpError(
-                f"the weights of LPIPS ({', '.join(missing)}) are not on this machine",
-                remedy="Put them on every node, or on none.",
-            )
-        method = inputs["method"] if self.shipped is None else PACKAGES / self.shipped
-        manifest = read_manifest(method)
-        evaluation = CaptureEvaluation(
-            manifest,
-            open_capture(inputs["capture"]),
-            self.split,
-            self.run,
-            self.time_limit,
-            self.confinement,
-            {name: known[name] for name in self.networks},
-            method_files(manifest.root),
-        )
-        if evaluation.key != self.key:
-            raise HwpError(
-                "method, capture or protocols are different on this machine",
-                where=evaluation.capture.info.id,
-                remedy="Install the same version everywhere, and change nothing while jobs run.",
-            )
-        evaluate_capture(evaluation, output, on_progress)

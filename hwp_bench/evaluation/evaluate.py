@@ -1,4 +1,8 @@
-"""Evaluate a method on a set of captures."""
+"""Evaluate a method on a set of captures: checks before any work, plans, the loop over captures.
+
+Whatever is wrong with a call is said before a suite is rendered for minutes (`check_call`,
+`check_suite`).
+"""
 
 from __future__ import annotations
 
@@ -8,33 +12,40 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from hwp_bench.base.console import notice
-from hwp_bench.base.errors import BadCapture, BadMethod, one_line
+from hwp_bench.base.errors import BadCapture, BadMethod, HwpError, UsageError, one_line
+from hwp_bench.base.files import Places, canonical_json, check_places, inside
 from hwp_bench.base.folders import exclusive
 from hwp_bench.base.packages import __version__
 from hwp_bench.base.records import check_json_values, merged, parse_record
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.splits import Split, split_for
-from hwp_bench.evaluation.capture_evaluation import (
-    CaptureEvaluation,
-    evaluation_job,
-)
+from hwp_bench.evaluation.capture_evaluation import CaptureEvaluation
 from hwp_bench.evaluation.results_folder import (
+    RESULTS,
+    announce_kept,
     finish_together,
     open_results_folder,
-    say_kept,
+    refuse_other,
 )
 from hwp_bench.methods.contents import digest_of, method_files, refuse_links_out
 from hwp_bench.methods.contract import FRAME_CHOICES, RunSettings
-from hwp_bench.methods.manifest import MethodManifest, find_method, read_manifest
-from hwp_bench.methods.setting_files import find_setting_files
+from hwp_bench.methods.manifest import (
+    DEFAULT_PRESET,
+    MethodManifest,
+    check_settings,
+    find_method,
+    find_setting_files,
+    read_manifest,
+)
 from hwp_bench.metrics import PROTOCOLS
 from hwp_bench.metrics.lpips import load_available
 from hwp_bench.metrics.score import Network
-from hwp_bench.results import CaptureResult, MethodId, Results
-from hwp_bench.results.environment import environment
+from hwp_bench.results import CaptureResult, MethodId, Results, write_results
+from hwp_bench.results.schema import environment
 from hwp_bench.run.engine import Engine, LocalEngine, Needs
 from hwp_bench.run.runner import DEFAULT_TIME_LIMIT, rehearse_method
 from hwp_bench.run.sandbox.confinement import Confinement
+from hwp_bench.sim.produce.suites import SuiteItem, is_rendered, suite
 
 #: Most seconds that a method may take to be made before the first capture.
 REHEARSAL_SECONDS = 600.0
@@ -86,95 +97,106 @@ def evaluate(
     overwrite: bool = False,
     rehearse: bool = False,
 ) -> Results:
-    """Evaluate a method.
+    """Evaluate a method; `run_plans` says what becomes of results that are there.
 
-    Every capture is opened and checked before the method runs on the first one. A capture's
-    result is on disk before the next begins, and an evaluation that is started again takes
-    finished captures as they are, and says so. Results of another evaluation that `out` holds are
-    refused, or stay until all new ones are whole.
-
-    Args:
-        method: method directory, or the name of one that ships with the toolkit.
-        captures: capture folders.
-        out: results folder.
-        settings: suite, preset, seed, budget, limits.
-        splits: splits by capture id; None applies the 80/10/10 rule.
-        on_capture: hook for showing progress, where captures are evaluated in turn.
-        engine: where captures are evaluated; one after another in this process if None.
-        needs: the share of a machine that one capture takes.
-        overwrite: results of another evaluation in `out` may be replaced.
-        rehearse: make the method once before the first capture, where any is to be run; not to be
-            asked for where it runs on other machines.
-
-    Returns:
-        The results, which `out/results.json` then holds, with tables in `out/tables`.
-
-    Raises:
-        UsageError: `out` holds results of another evaluation.
-        BadMethod: the method directory is wrong, or its files change meanwhile.
-        MethodFailed: the method cannot be made.
-        BadCapture, BadInput, BadImage, BadSplit: a capture is wrong.
-        HwpError: another evaluation is writing to `out`, or it cannot be written.
+    `splits` go by capture id; None applies the 80/10/10 rule. `out/results.json` then holds the
+    results, `out/tables` their tables.
     """
     manifest = read_manifest(find_method(method))
     settings = with_setting_files(manifest, settings)
     plan = make_plan(manifest, open_captures(captures, splits), settings)
-    with exclusive(out):
-        return _evaluate(
-            plan, out, engine, needs, on_capture, overwrite=overwrite, rehearse=rehearse
-        )
+    order = [("", place) for place in range(len(plan.evaluations))]
+    results = run_plans(
+        out,
+        {"": plan},
+        order,
+        on_start=on_capture,
+        engine=engine,
+        needs=needs,
+        overwrite=overwrite,
+        rehearse=rehearse,
+    )
+    return results[""]
 
 
-def _evaluate(
-    plan: Plan,
+def run_plans(
     out: Path,
+    plans: Mapping[str, Plan],
+    order: Sequence[tuple[str, int]],
+    *,
+    on_start: OnCapture | None,
     engine: Engine | None,
     needs: Needs | None,
-    on_capture: OnCapture | None,
-    *,
     overwrite: bool,
     rehearse: bool,
-) -> Results:
-    """Run what is missing of a plan, with the lock of its folder."""
-    for evaluation in plan.evaluations:
-        if evaluation.capture.lacks_masks:
-            name = evaluation.capture.info.id
-            notice(f"{name}: its true masks are not there: scored on its estimated masks")
-    folder = open_results_folder(out, plan.results([]), plan.evaluations, overwrite=overwrite)
-    say_kept([folder])
-    missing, found = folder.missing, dict(folder.kept)
-    if rehearse and missing:
-        plan.rehearse()
-    jobs = []
-    for place in missing:
-        evaluation = hiding(plan.evaluations[place], out)
-        text = evaluation.capture.info.id
-        jobs.append(evaluation_job(evaluation, folder.unfinished(place), text, needs or Needs()))
+    tables: bool = True,
+) -> dict[str, Results]:
+    """Run what is missing of some plans, each in a folder below `out`, with the lock of `out`.
 
-    def on_done(index: int) -> None:
-        found[missing[index]] = folder.finish(missing[index])
+    A capture's result is on disk before the next begins. Results of the same key are taken as they
+    are, and that is said; results of another evaluation are refused, or stay until all new ones
+    are whole (`overwrite`).
 
-    (engine or LocalEngine()).run(jobs, on_done, on_capture)
-    results = plan.results([found[place] for place in range(len(plan.evaluations))])
-    finish_together([(folder, results)], tables=True)
-    return results
+    Args:
+        out: the results folder.
+        plans: by their folder below `out`; an empty name is `out` itself.
+        order: folder and place of the capture, in the order in which they are to begin.
+        on_start: hook for showing progress, where captures are evaluated in turn.
+        engine: where captures are evaluated; one after another in this process if None.
+        needs: the share of a machine that one capture takes.
+        overwrite: results of another evaluation in `out` may be replaced.
+        rehearse: make the method of each plan once before the first capture, where any is to be
+            run; not to be asked for where it runs on other machines.
+        tables: write the tables of each; without, its record is there as soon as its first result.
+    """
+    with exclusive(out):
+        for evaluation in next(iter(plans.values())).evaluations:
+            if evaluation.capture.lacks_masks:
+                name = evaluation.capture.info.id
+                notice(f"{name}: its true masks are not there: scored on its estimated masks")
+        folders = {
+            name: open_results_folder(
+                out / name, plan.results([]), plan.evaluations, overwrite=overwrite
+            )
+            for name, plan in plans.items()
+        }
+        announce_kept(list(folders.values()))
+        found = {name: dict(folder.kept) for name, folder in folders.items()}
+        missing = [(name, place) for name, place in order if place not in found[name]]
+        if rehearse:
+            # Plans that differ in their seeds alone are made once.
+            first = {
+                canonical_json(plans[name].settings.run.settings): plans[name]
+                for name, _ in missing
+            }
+            for plan in first.values():
+                plan.rehearse()
+        jobs = []
+        for name, place in missing:
+            evaluation = plans[name].evaluations[place].hiding(out)
+            text = ", ".join(filter(None, (evaluation.capture.info.id, plans[name].title)))
+            jobs.append(evaluation.job(folders[name].unfinished(place), text, needs or Needs()))
 
+        def record(name: str) -> Results:
+            # By place, so that a record lists captures in one order whichever ended first.
+            return plans[name].results([result for _, result in sorted(found[name].items())])
 
-def hiding(evaluation: CaptureEvaluation, out: Path) -> CaptureEvaluation:
-    """Return an evaluation whose method does not see a results folder, with its test frames."""
-    confinement = evaluation.confinement
-    hidden = (*confinement.hidden, out.absolute())
-    return replace(evaluation, confinement=replace(confinement, hidden=hidden))
+        def on_done(index: int) -> None:
+            name, place = missing[index]
+            found[name][place] = folders[name].finish(place)
+            if not tables and not folders[name].replaces:
+                write_results(folders[name].root / RESULTS, record(name))
+
+        (engine or LocalEngine()).run(jobs, on_done, on_start)
+        results = {name: record(name) for name in plans}
+        finish_together([(folders[name], results[name]) for name in plans], tables=tables)
+        return results
 
 
 def with_setting_files(
     manifest: MethodManifest, settings: EvaluationSettings
 ) -> EvaluationSettings:
-    """Expose the files that a person's settings name, with absolute paths in the settings.
-
-    Raises:
-        UsageError: one of them is not there.
-    """
+    """Expose the files that a person's settings name, with absolute paths in the settings."""
     chosen, files = find_setting_files(manifest, settings.run.settings)
     exposed = tuple(dict.fromkeys((*settings.confinement.exposed, *files)))
     return replace(
@@ -190,44 +212,35 @@ class Plan:
 
     #: The method.
     manifest: MethodManifest
-    #: Name of the suite.
-    suite: str
-    #: Name of the preset that is taken.
-    preset: str
-    #: The preset with its overrides, seed, budget and training frames.
-    run: RunSettings
+    #: How it is evaluated: the preset that is taken, and all settings of the method.
+    settings: EvaluationSettings
     #: One for each capture.
     evaluations: tuple[CaptureEvaluation, ...]
     #: When the plan was made, ISO 8601, UTC.
     started: str
     #: Digest of the method when the plan was made.
     digest: str
-    #: Seconds after which a method is stopped, and how it is confined.
-    time_limit: float
-    confinement: Confinement
+    #: What tells it from other plans of one command; empty where there is one.
+    title: str = ""
 
     def rehearse(self) -> None:
-        """Make the method once with its settings: what fails there would fail on every capture.
-
-        Raises:
-            MethodFailed: it cannot be made; its last lines have been printed.
-            BadMethod: there is no such program.
-        """
-        limit = min(self.time_limit, REHEARSAL_SECONDS)
-        rehearse_method(self.manifest, self.run, time_limit=limit, confinement=self.confinement)
+        """Make the method once with its settings: what fails there would fail on every capture."""
+        settings = self.settings
+        rehearse_method(
+            self.manifest,
+            settings.run,
+            time_limit=min(settings.time_limit, REHEARSAL_SECONDS),
+            confinement=settings.confinement,
+        )
 
     def results(self, finished: Sequence[CaptureResult]) -> Results:
         """Return the record of the captures that are finished."""
-        manifest, run = self.manifest, self.run
+        name, title, run = self.manifest.name, one_line(self.manifest.title), self.settings.run
         return Results(
             method=MethodId(
-                manifest.name,
-                one_line(manifest.title),
-                self.digest,
-                self.preset,
-                dict(run.settings),
+                name, title, self.digest, self.settings.preset or DEFAULT_PRESET, dict(run.settings)
             ),
-            suite=self.suite,
+            suite=self.settings.suite,
             seed=run.seed,
             budget={"seconds": run.budget.seconds, "steps": run.budget.steps},
             frames=run.frames,
@@ -244,48 +257,34 @@ def make_plan(
     captures: Sequence[tuple[Capture, Split]],
     settings: EvaluationSettings,
     networks: Mapping[str, Network] | None = None,
+    title: str = "",
 ) -> Plan:
-    """Plan an evaluation; nothing runs yet.
-
-    Args:
-        manifest: the method.
-        captures: what `open_captures` returned.
-        settings: suite, preset, seed, budget, limits.
-        networks: LPIPS by backbone; None loads those whose weights are there.
-
-    Raises:
-        BadMethod: there is no such preset, or an override is not a plain value or not a setting
-            of the method, or the result could not be read again, or the method has a link to what
-            is in no digest.
-    """
+    """Plan an evaluation; nothing runs yet. `networks` None loads those whose weights are there."""
     preset = manifest.preset(settings.preset, settings.suite)
     check_json_values(
         dict(settings.run.settings), where=manifest.name, field="settings", error=BadMethod
     )
     manifest.check_setting_names(settings.run.settings)
     chosen = merged(manifest.presets.get(preset, {}), settings.run.settings)
-    run = replace(settings.run, settings=chosen)
+    settings = replace(settings, preset=preset, run=replace(settings.run, settings=chosen))
     refuse_links_out(manifest.root, settings.confinement.exposed)
     files = method_files(manifest.root)
     known = load_available() if networks is None else networks
     evaluations = tuple(
         CaptureEvaluation(
-            manifest, capture, split, run, settings.time_limit, settings.confinement, known, files
+            manifest,
+            capture,
+            split,
+            settings.run,
+            settings.time_limit,
+            settings.confinement,
+            known,
+            files,
         )
         for capture, split in captures
     )
     started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-    plan = Plan(
-        manifest,
-        settings.suite,
-        preset,
-        run,
-        evaluations,
-        started,
-        digest_of(files),
-        settings.time_limit,
-        settings.confinement,
-    )
+    plan = Plan(manifest, settings, evaluations, started, digest_of(files), title)
     # Before anything runs: what is to be written will have to be read.
     head = asdict(plan.results([]))
     parse_record(Results, head, where=manifest.name, error=BadMethod)
@@ -295,15 +294,7 @@ def make_plan(
 def open_captures(
     paths: Sequence[Path], splits: Mapping[str, Split] | None = None
 ) -> list[tuple[Capture, Split]]:
-    """Open captures, each with its split.
-
-    Args:
-        paths: capture folders.
-        splits: splits by capture id; None applies the 80/10/10 rule.
-
-    Raises:
-        BadCapture, BadInput, BadImage, BadSplit: a capture is wrong, or two have one id.
-    """
+    """Open captures, each with its split."""
     opened: list[tuple[Capture, Split]] = []
     for path in paths:
         capture = open_capture(path)
@@ -316,3 +307,83 @@ def open_captures(
             )
         opened.append((capture, split_for(capture.info.id, len(capture), splits)))
     return opened
+
+
+def check_results_place(
+    manifest: MethodManifest, out: Path, inputs: Mapping[str, Places], option: str = "--out"
+) -> None:
+    """Refuse results that would lie in the method or in data, or replace data.
+
+    A method could read results in its own folder, and they would change its digest.
+    """
+    check_places({option: out}, {"METHOD_DIR": manifest.root, **inputs})
+    check_places({f"{option}, captures": out / "captures"}, inputs, replaces=True)
+
+
+def check_call(
+    manifest: MethodManifest,
+    settings: EvaluationSettings,
+    out: Path,
+    field: str = "settings",
+    *,
+    overwrite: bool = False,
+) -> None:
+    """Refuse a call that cannot work, as far as it can be told from the call alone."""
+    check_settings(manifest, settings.run.settings, field)
+    manifest.preset(settings.preset, settings.suite)
+    if settings.run.frames not in FRAME_CHOICES and ":" not in settings.run.frames:
+        known = ", ".join(FRAME_CHOICES)
+        raise UsageError(f"{settings.run.frames!r} is not one of {known}", field="frames")
+    for path in settings.confinement.exposed:
+        if not path.exists():
+            raise UsageError("does not exist", where=path, field="--expose")
+    above = next((place for place in (out, *out.absolute().parents) if place.exists()), out)
+    if above.exists() and not above.is_dir():
+        raise HwpError(
+            "cannot be a results folder, because a file is there",
+            where=above,
+            remedy="Choose another folder with --out.",
+        )
+    if not overwrite:
+        plan = make_plan(manifest, (), with_setting_files(manifest, settings), {})
+        refuse_other(out, plan.results([]))
+
+
+def check_suite(
+    manifest: MethodManifest,
+    settings: EvaluationSettings,
+    out: Path,
+    splits: Mapping[str, Split] | None = None,
+    *,
+    rehearse: bool = True,
+) -> bool:
+    """Refuse what would fail on a suite, before it is rendered."""
+    items = suite(settings.suite)
+    for item in items:
+        split_for(item.scene.id, item.frame_count, splits)
+    if manifest.kind == "predictions":
+        _check_predictions(manifest, items)
+    if is_rendered(settings.suite):
+        return False
+    with exclusive(out):
+        pass
+    if rehearse:
+        make_plan(manifest, (), with_setting_files(manifest, settings), {}).rehearse()
+    return rehearse
+
+
+def _check_predictions(manifest: MethodManifest, items: Sequence[SuiteItem]) -> None:
+    names = [item.scene.id for item in items]
+    folders = {
+        name: inside(manifest.root, f"{manifest.entry.predictions}/{name}") for name in names
+    }
+    missing = [name for name, folder in folders.items() if not any(folder.glob("*.png"))]
+    if len(missing) == len(names):
+        raise BadMethod(
+            f"has predictions of no capture of this suite ({', '.join(names)})",
+            where=manifest.root / str(manifest.entry.predictions),
+            remedy=f"Put the frames into {manifest.entry.predictions}/CAPTURE/, or choose another "
+            "suite.",
+        )
+    if missing:
+        notice(f"no predictions of {', '.join(missing)}: every frame there gets the penalty")

@@ -30,8 +30,7 @@ from hwp_bench.evaluation.capture_evaluation import (
     read_result,
     stored_result,
 )
-from hwp_bench.report.evaluation_tables import all_tables
-from hwp_bench.report.free_view_table import free_view_tables
+from hwp_bench.report.tables import all_tables, free_view_tables
 from hwp_bench.results import CaptureResult, Results, read_results, write_results
 
 #: Folder of results that are not whole yet, inside `captures`; no capture has such an id.
@@ -91,12 +90,7 @@ class ResultsFolder:
 
 
 def finish_together(finished: Sequence[tuple[ResultsFolder, Results]], *, tables: bool) -> None:
-    """Write the records of whole evaluations of one command; old results go only now.
-
-    Args:
-        finished: the folders with their records.
-        tables: write each one's tables too.
-    """
+    """Write the records of whole evaluations of one command; old results go only now."""
     with _interrupts_later():
         for folder, results in finished:
             if folder.replaces:
@@ -114,17 +108,7 @@ def finish_together(finished: Sequence[tuple[ResultsFolder, Results]], *, tables
 def open_results_folder(
     root: Path, head: Results, evaluations: Sequence[CaptureEvaluation], *, overwrite: bool = False
 ) -> ResultsFolder:
-    """Look at what a folder holds, and say what of it is kept; to be called under its lock.
-
-    Args:
-        root: the folder.
-        head: the record of the evaluation, without captures.
-        evaluations: one a capture.
-        overwrite: results of another evaluation may be replaced.
-
-    Raises:
-        UsageError: it holds results of another evaluation; the message says what differs.
-    """
+    """Look at what a folder holds, and say what of it is kept; to be called under its lock."""
     with disc_errors(root):
         _clean(root)
     problems = differences(root, head, evaluations)
@@ -147,7 +131,7 @@ def open_results_folder(
     return folder
 
 
-def say_kept(folders: Sequence[ResultsFolder]) -> None:
+def announce_kept(folders: Sequence[ResultsFolder]) -> None:
     """Say which results are kept, because their key is that of this evaluation."""
     names = [
         folder.evaluations[place].capture.info.id for folder in folders for place in folder.kept
@@ -160,11 +144,7 @@ def say_kept(folders: Sequence[ResultsFolder]) -> None:
 
 
 def refuse_other(root: Path, head: Results) -> None:
-    """Refuse a folder with results of another evaluation, before captures are made for it.
-
-    Raises:
-        UsageError: as `open_results_folder`.
-    """
+    """Refuse a folder with results of another evaluation, before captures are made for it."""
     problems = differences(root, head, ())
     if problems:
         raise _other(root, problems)
@@ -182,11 +162,6 @@ def differences(root: Path, head: Results, evaluations: Sequence[CaptureEvaluati
     """Return in words what results in a folder differ in from those that are to come.
 
     Captures on which the method failed do not count: nothing of them could be lost.
-
-    Args:
-        root: the folder; it need not exist.
-        head: the record of the evaluation, without captures.
-        evaluations: one a capture; empty where the captures are not known yet.
     """
     problems = []
     stored = None

@@ -10,15 +10,17 @@ import hashlib
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from hwp_bench.base.errors import BadCapture, BadPrediction, HwpError, bounded
+from hwp_bench.base.errors import BadCapture, BadInput, BadPrediction, HwpError, bounded
+from hwp_bench.base.files import read_json
 from hwp_bench.base.images import MAX_PIXELS, pixel_digest, read_rgb
 from hwp_bench.capture import Capture
 from hwp_bench.capture.schema import frame_name
-from hwp_bench.metrics.pixels import scored_pixels
+from hwp_bench.metrics.pixels import decibels, scored_pixels
 from hwp_bench.metrics.protocol import HWP_V1
 from hwp_bench.metrics.score import Frame, Network, score_frames
 from hwp_bench.results import FrameResult
@@ -40,6 +42,16 @@ class Target:
     #: Whether the mask is exact coverage.
     exact: bool
 
+    @cached_property
+    def region(self) -> np.ndarray:
+        """(H, W) bool: the scored pixels."""
+        return scored_pixels(self.mask, erosion=HWP_V1.mask_erosion, coverage=self.exact)
+
+    def masked(self, image: np.ndarray | None = None) -> np.ndarray:
+        """(H, W, 3): an image, or nothing, black outside the scored pixels."""
+        image = np.zeros_like(self.pixels) if image is None else image
+        return np.where(self.region[..., None], image, np.uint8(0))
+
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
@@ -53,21 +65,42 @@ class Prediction:
     failure: str | None
 
 
-def read_targets(capture: Capture, frames: Sequence[int]) -> list[Target]:
-    """Read the truth of the given frames, before any method runs.
+@dataclass(frozen=True, eq=False)
+class ScoredFrames:
+    """Predictions of some frames of a capture, or of its free-view clip, with their scores."""
 
-    Raises:
-        BadImage: a frame or mask is missing or damaged.
-        BadCapture: frames show no hand that could be scored; no method can be blamed for it.
-    """
-    targets = []
-    empty = []
-    for frame in frames:
-        mask, exact = capture.scoring_mask(frame)
-        if not scored_pixels(mask, erosion=HWP_V1.mask_erosion, coverage=exact).any():
-            empty.append(frame)
-            continue
-        targets.append(Target(frame, capture.frame(frame), mask, exact))
+    #: The truth.
+    targets: Sequence[Target]
+    #: One for each target, in the same order, as the scores.
+    predictions: Sequence[Prediction]
+    scores: list[FrameResult]
+    #: Folder that the predictions were read from.
+    source: Path
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 (hex) over the decoded pixels of the predictions."""
+        return predictions_digest(self.predictions)
+
+
+def score_frames_of(
+    targets: Sequence[Target],
+    source: Path,
+    size: tuple[int, int],
+    networks: Mapping[str, Network] | None = None,
+) -> ScoredFrames:
+    """Read and score the predictions of some frames of (height, width) px in a folder."""
+    predictions = read_predictions(source, [target.frame for target in targets], size)
+    scores = score_predictions(targets, predictions, networks)
+    return ScoredFrames(targets, predictions, scores, source)
+
+
+def read_targets(capture: Capture, frames: Sequence[int]) -> list[Target]:
+    """Read the truth of the given frames, before any method runs."""
+    targets = [
+        Target(frame, capture.frame(frame), *capture.scoring_mask(frame)) for frame in frames
+    ]
+    empty = [target.frame for target in targets if not target.region.any()]
     if empty:
         several = len(empty) > 1
         raise BadCapture(
@@ -120,16 +153,7 @@ def score_predictions(
     predictions: Sequence[Prediction],
     networks: Mapping[str, Network] | None = None,
 ) -> list[FrameResult]:
-    """Score predictions in every protocol.
-
-    Args:
-        targets: the truth.
-        predictions: one for each target, in the same order.
-        networks: LPIPS by backbone, where the weights are at hand.
-
-    Returns:
-        One result a target; a prediction that failed has the declared penalties.
-    """
+    """Score predictions in every protocol."""
     frames = [
         Frame(
             BadPrediction(prediction.failure or "")
@@ -168,3 +192,60 @@ def predictions_digest(predictions: Sequence[Prediction]) -> str:
         )
         total.update(content.encode())
     return total.hexdigest()
+
+
+#: The sentences about a capture, inside its result folder; absent where there are none.
+WARNINGS = "warnings.json"
+#: Share of the scored values that are 255 from which an image is taken to be clipped.
+WHITE = 0.9
+#: Gain by exchanging red and blue from which the order is doubted, dB.
+EXCHANGE_GAIN = 3.0
+#: Share of the frames that must be better with them exchanged.
+EXCHANGE_FRAMES = 0.75
+
+
+def colour_warnings(targets: Sequence[Target], predictions: Sequence[Prediction]) -> list[str]:
+    """Return sentences about colours that cannot be meant, with the numbers; mostly none."""
+    pairs = [
+        (image[target.region].astype(np.float64), target.pixels[target.region].astype(np.float64))
+        for target, prediction in zip(targets, predictions, strict=True)
+        if (image := prediction.pixels) is not None
+    ]
+    if not pairs:
+        return []
+    drawn, true = (np.concatenate(part) for part in zip(*pairs, strict=True))
+    means = f"their mean is {drawn.mean():.1f} of 255, the truth's {true.mean():.1f}"
+    if drawn.max() <= 1 < true.max():
+        return [
+            f"no colour of the predictions is above {drawn.max():.0f} of 255 ({means}): were "
+            "colours in [0, 1] stored without being multiplied by 255?"
+        ]
+    white, true_white = float((drawn == 255).mean()), float((true == 255).mean())
+    if white > WHITE > 2 * true_white:
+        return [
+            f"{100 * white:.0f} % of the predicted colours are 255 ({means}): were colours in "
+            "[0, 255] returned where [0, 1] is expected? They are clipped."
+        ]
+    return _exchange_warning(pairs)
+
+
+def _exchange_warning(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[str]:
+    """Compare the squared errors with those of the predictions with red and blue exchanged."""
+    kept = np.array([((drawn - true) ** 2).mean() for drawn, true in pairs])
+    swapped = np.array([((drawn[:, ::-1] - true) ** 2).mean() for drawn, true in pairs])
+    before, after = (decibels(float(errors.mean()) / 255.0**2) for errors in (kept, swapped))
+    if after - before < EXCHANGE_GAIN or (swapped < kept).mean() < EXCHANGE_FRAMES:
+        return []
+    return [
+        f"with red and blue exchanged the predictions would have {after:.1f} dB in place of "
+        f"{before:.1f} dB: are their channels in the order RGB?"
+    ]
+
+
+def read_warnings(folder: Path) -> list[str]:
+    """Return the sentences that an evaluation left; none where the file is absent or damaged."""
+    try:
+        value = read_json(folder / WARNINGS, max_bytes=100_000)
+    except BadInput:
+        return []
+    return [text for text in value if isinstance(text, str)] if isinstance(value, list) else []

@@ -1,53 +1,75 @@
 """Recompute the digests and scores of a result from its stored predictions.
 
-PSNR and SSIM of some frames are computed a second time, by scikit-image. What no pixel decides is
-bound otherwise (`hwp_bench/evaluation/bindings.py`).
+PSNR and SSIM of some frames are computed a second time, by scikit-image. What no pixel decides
+(labels, keys, stored copies, tables) is compared with what binds it.
 """
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from hwp_bench.base.arrays import evenly
 from hwp_bench.base.errors import BadSplit, HwpError
 from hwp_bench.base.files import inside, read_json, sha256_json
+from hwp_bench.base.images import as_float
 from hwp_bench.base.packages import __version__
+from hwp_bench.base.tables import FORMATS, format_table
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.check import check_capture
 from hwp_bench.capture.splits import Split, split_for
-from hwp_bench.evaluation import cross_check
-from hwp_bench.evaluation.bindings import (
-    Discrepancy,
-    copy_differences,
-    digest_differences,
-    failure_differences,
-    key_differences,
-    label_differences,
-    suite_differences,
-    table_differences,
-)
-from hwp_bench.evaluation.capture_evaluation import RESULT
-from hwp_bench.evaluation.free_view import PREDICTIONS as FREE_PREDICTIONS
-from hwp_bench.evaluation.scoring import (
-    Prediction,
-    Target,
-    predictions_digest,
-    read_predictions,
-    read_targets,
-    score_predictions,
-)
+from hwp_bench.evaluation.artifacts import FREE_PREDICTIONS
+from hwp_bench.evaluation.capture_evaluation import RESULT, key_of
+from hwp_bench.evaluation.scoring import ScoredFrames, Target, read_targets, score_frames_of
+from hwp_bench.evaluation.sentences import find_missing, find_other_captures, is_of_suite
 from hwp_bench.metrics import METRICS, PROTOCOLS, metric_names
 from hwp_bench.metrics.lpips import load_available
+from hwp_bench.metrics.protocol import HWP_V1, Protocol
 from hwp_bench.metrics.score import Network
-from hwp_bench.results import CaptureResult, FrameResult, Results, read_results
-from hwp_bench.results.bounds import MAX_BYTES
-from hwp_bench.results.environment import code_digest, environment
+from hwp_bench.report.tables import all_tables, free_view_tables
+from hwp_bench.results import (
+    CaptureResult,
+    FrameResult,
+    FreeViewResult,
+    Results,
+    read_results,
+)
+from hwp_bench.results.schema import MAX_BYTES, code_digest, environment
+from hwp_bench.results.store import content_digest
+from hwp_bench.sim.produce.suites import suite_names
 
 #: Largest difference of a score that rounding on another processor may make.
 TOLERANCE = 1e-6
+#: Largest difference between a score and scikit-image's: dB of PSNR, or units of SSIM. Both are
+#: computed in float64, where the sums differ only in their order.
+CROSS_TOLERANCE = 1e-6
+#: Most frames of a capture that are cross-checked.
+CROSS_SAMPLE = 4
+# Longest value of a field that a difference repeats.
+_SHOWN = 100
+
+
+@dataclass(frozen=True)
+class Discrepancy:
+    """One part of a result that is not as the result says."""
+
+    #: Id of the capture; empty for the whole result.
+    capture: str
+    #: The part that was verified: `capture`, `split`, `frames`, `predictions`, `protocols`, a label
+    #: (`hands`, `perturbations`, `exact_masks`, `made_by`), `key`, `suite`, `digest`, a stored
+    #: copy or table, or a frame and metric.
+    what: str
+    #: Its value in the result.
+    recorded: str
+    #: Its value as it was found.
+    found: str
 
 
 @dataclass(frozen=True)
@@ -83,10 +105,11 @@ def verify_results(
     """Recompute the digests of captures, splits and predictions, scores and tables of a result.
 
     Labels are compared with the captures and the suite, each capture with its stored copy, and
-    the whole with the key and the digest that it states.
+    the whole with the key and the digest that it states. The predictions lie in
+    `captures/ID/predictions` next to the result file.
 
     Args:
-        file: the result file; the predictions lie in `captures/ID/predictions` next to it.
+        file: the result file.
         captures: folders of the captures; further ones do no harm.
         splits: splits by capture id; None applies the 80/10/10 rule.
 
@@ -99,33 +122,39 @@ def verify_results(
     found: list[Discrepancy] = []
     ours = json.loads(json.dumps({protocol.name: protocol.as_dict() for protocol in PROTOCOLS}))
     if results.protocols != ours:
-        found.append(Discrepancy("", "protocols", _brief(results.protocols), _brief(ours)))
+        found.append(Discrepancy("", "protocols", _digests(results.protocols), _digests(ours)))
     known = _by_id(captures)
-    networks = load_available()
-    frames = scored = checked = 0
-    fitting = []
+    scorer = _Scorer(load_available())
+    scored, fitting = 0, []
     for record in results.captures:
         capture = next((c for c in known.get(record.id, []) if c.digest == record.digest), None)
-        fitting += [] if capture is None else [capture]
-        differences, count, cross = _verify_capture(file.parent, record, known, splits, networks)
-        clip = None if capture is None or capture.free_view is None else capture.free_view.digest
-        found += [*differences, *failure_differences(record)]
-        found += key_differences(results, record, clip)
-        frames += count
-        scored += count > 0
-        checked += cross
-    found += suite_differences(results, fitting, own_splits=splits is not None)
+        before = scorer.frames
+        if capture is None:
+            seen = ", ".join(one.digest for one in known.get(record.id, []))
+            seen = seen or "no capture of this id"
+            found.append(Discrepancy(record.id, "capture", record.digest, seen))
+        else:
+            fitting.append(capture)
+            found += _capture_differences(file.parent, record, capture, splits, scorer)
+        scored += scorer.frames > before
+        drawn = sum(frame.failure is None for frame in record.frames)
+        if record.failure is not None and drawn:
+            text = f"{drawn} frames have predictions"
+            found.append(Discrepancy(record.id, "failure", "every frame", text))
+        found += _key_differences(results, record, capture)
+    found += _suite_differences(results, fitting, own_splits=splits is not None)
     found += copy_differences(file.parent, stored, RESULT)
     own = results.environment.get("code") == code_digest()
     if own:
-        found += table_differences(file.parent, results)
+        found += _table_differences(file.parent, results)
     found += digest_differences(stored, expected=own)
-    notes = _notes(results, networks)
+    notes = _notes(results, scorer.networks)
     if not own and (file.parent / "tables").is_dir():
         notes.append("The tables next to it were not compared: other code made them.")
     if stored.get("digest") is None and not own:
         notes.append("It states no digest of its content: times and curves are as the file says.")
-    return Verification(str(file), scored, frames, tuple(found), tuple(notes), checked)
+    counts = scored, scorer.frames
+    return Verification(str(file), *counts, tuple(found), tuple(notes), scorer.cross_checked)
 
 
 def _by_id(folders: Sequence[Path]) -> dict[str, list[Capture]]:
@@ -139,126 +168,123 @@ def _by_id(folders: Sequence[Path]) -> dict[str, list[Capture]]:
     return known
 
 
-def _verify_capture(
+# --- scores
+
+
+def _capture_differences(
     root: Path,
     record: CaptureResult,
-    known: Mapping[str, Sequence[Capture]],
+    capture: Capture,
     splits: Mapping[str, Split] | None,
-    networks: Mapping[str, Network],
-) -> tuple[list[Discrepancy], int, int]:
-    """Return the differences, and how many frames were scored again and cross-checked."""
+    scorer: _Scorer,
+) -> list[Discrepancy]:
+    """Compare one capture of a result, and the free-view clip in it, with what is stored of it."""
     name = record.id
-    candidates = known.get(name, [])
-    fitting = [capture for capture in candidates if capture.digest == record.digest]
-    if not fitting:
-        seen = ", ".join(capture.digest for capture in candidates) or "no capture of this id"
-        return [Discrepancy(name, "capture", record.digest, seen)], 0, 0
-    capture = fitting[0]
     damage = [item for item in check_capture(capture.root).findings if item.level == "error"]
     if damage:
         problem = f"{damage[0].where}: {damage[0].problem}"
-        return [Discrepancy(name, "capture", "an intact capture", problem)], 0, 0
-    found: list[Discrepancy] = []
-    numbers = [frame.frame for frame in record.frames]
+        return [Discrepancy(name, "capture", "an intact capture", problem)]
     try:
         split = split_for(name, len(capture), splits)
     except BadSplit as error:
-        return [Discrepancy(name, "split", record.split_digest, error.problem)], 0, 0
+        return [Discrepancy(name, "split", record.split_digest, error.problem)]
+    found: list[Discrepancy] = []
+    numbers = [frame.frame for frame in record.frames]
     if split.digest != record.split_digest:
         found.append(Discrepancy(name, "split", record.split_digest, split.digest))
     elif split.test.tolist() != numbers:
         found.append(Discrepancy(name, "frames", str(numbers), str(split.test.tolist())))
     if any(not 0 <= number < len(capture) for number in numbers):
-        return found, 0, 0
+        return found
     targets = read_targets(capture, numbers)
-    found += label_differences(record, capture, all(target.exact for target in targets))
-    predictions = read_predictions(
-        inside(root, f"captures/{name}/predictions"), numbers, capture.size
+    found += _label_differences(record, capture, all(target.exact for target in targets))
+    found += scorer.compare(
+        name, record, targets, inside(root, f"captures/{name}/predictions"), capture.size
     )
-    digest = predictions_digest(predictions)
-    if digest != record.predictions_digest:
-        found.append(Discrepancy(name, "predictions", record.predictions_digest, digest))
-    for old, new in zip(
-        record.frames, score_predictions(targets, predictions, networks), strict=True
-    ):
-        found += _compare_frame(name, old, new)
-    differences, checked = _cross_check(name, record.frames, targets, predictions)
-    free, count, more = _verify_free_view(root, record, capture, networks)
-    return found + differences + free, len(numbers) + count, checked + more
+    return found + _free_view_differences(root, record, capture, scorer)
 
 
-def _verify_free_view(
-    root: Path, record: CaptureResult, capture: Capture, networks: Mapping[str, Network]
-) -> tuple[list[Discrepancy], int, int]:
-    """As `_verify_capture`, of the free-view clip; nothing where the result has no scores of it."""
-    stored, name = record.free_view, f"{record.id}, free view"
+def _free_view_differences(
+    root: Path, record: CaptureResult, capture: Capture, scorer: _Scorer
+) -> list[Discrepancy]:
+    """The same of the free-view clip; nothing where the result has no scores of it."""
+    stored, clip, name = record.free_view, capture.free_view, f"{record.id}, free view"
+    folder = inside(root, f"captures/{record.id}/{FREE_PREDICTIONS}")
     if stored is None:
-        drawn = inside(root, f"captures/{record.id}/{FREE_PREDICTIONS}")
-        left = capture.free_view is not None and drawn.is_dir()
-        return [Discrepancy(name, "scores", "none", "predictions")] if left else [], 0, 0
-    clip = capture.free_view
+        left = clip is not None and folder.is_dir()
+        return [Discrepancy(name, "scores", "none", "predictions")] if left else []
     if clip is None or clip.digest != stored.digest:
         here = "no clip" if clip is None else clip.digest
-        return [Discrepancy(name, "capture", stored.digest, here)], 0, 0
+        return [Discrepancy(name, "capture", stored.digest, here)]
     numbers = [frame.frame for frame in stored.frames]
     if numbers != list(range(len(clip))):
-        return [Discrepancy(name, "frames", str(numbers), f"0 to {len(clip) - 1}")], 0, 0
-    targets = read_targets(clip, numbers)
-    folder = inside(root, f"captures/{record.id}/{FREE_PREDICTIONS}")
-    predictions = read_predictions(folder, numbers, clip.size)
-    found, digest = [], predictions_digest(predictions)
-    if digest != stored.predictions_digest:
-        found.append(Discrepancy(name, "predictions", stored.predictions_digest, digest))
-    for old, new in zip(
-        stored.frames, score_predictions(targets, predictions, networks), strict=True
-    ):
-        found += _compare_frame(name, old, new)
-    differences, checked = _cross_check(name, stored.frames, targets, predictions)
-    return found + differences, len(numbers), checked
+        return [Discrepancy(name, "frames", str(numbers), f"0 to {len(clip) - 1}")]
+    return scorer.compare(name, stored, read_targets(clip, numbers), folder, clip.size)
 
 
-def _cross_check(
-    name: str,
-    frames: Sequence[FrameResult],
-    targets: Sequence[Target],
-    predictions: Sequence[Prediction],
-) -> tuple[list[Discrepancy], int]:
-    """Compare some recorded scores with scikit-image's; returns differences and frames."""
-    found = []
-    valid = [place for place, item in enumerate(predictions) if item.pixels is not None]
-    sample = [valid[place] for place in cross_check.sample_frames(len(valid))] if valid else []
-    for place in sample:
-        target, pixels, old = targets[place], predictions[place].pixels, frames[place]
-        assert pixels is not None
-        scores = cross_check.reference_scores(
-            pixels, target.pixels, target.mask, coverage=target.exact
-        )
-        for metric, value in scores.items():
-            recorded = old.scores.get(metric)
-            if recorded is None or abs(recorded - value) > cross_check.TOLERANCE:
-                what = f"frame {old.frame}, {metric} by scikit-image"
-                found.append(Discrepancy(name, what, repr(recorded), repr(value)))
-    return found, len(sample)
+class _Scorer:
+    """Scores stored predictions again, with networks by backbone, and counts the frames."""
+
+    def __init__(self, networks: Mapping[str, Network]) -> None:
+        self.networks = networks
+        self.frames = self.cross_checked = 0
+
+    def compare(
+        self,
+        name: str,
+        record: CaptureResult | FreeViewResult,
+        targets: Sequence[Target],
+        folder: Path,
+        size: tuple[int, int],
+    ) -> list[Discrepancy]:
+        """Compare recorded scores with those of the predictions in a folder."""
+        scored = score_frames_of(targets, folder, size, self.networks)
+        found = []
+        if scored.digest != record.predictions_digest:
+            found.append(Discrepancy(name, "predictions", record.predictions_digest, scored.digest))
+        for old, new in zip(record.frames, scored.scores, strict=True):
+            found += _frame_differences(name, old, new)
+        self.frames += len(targets)
+        return found + self._cross_check(name, record.frames, scored)
+
+    def _cross_check(
+        self,
+        name: str,
+        frames: Sequence[FrameResult],
+        scored: ScoredFrames,
+    ) -> list[Discrepancy]:
+        """Compare some recorded scores with scikit-image's."""
+        found = []
+        valid = [place for place, one in enumerate(scored.predictions) if one.pixels is not None]
+        for place in [valid[sample] for sample in sample_frames(len(valid))] if valid else []:
+            target, pixels = scored.targets[place], scored.predictions[place].pixels
+            old = frames[place]
+            assert pixels is not None
+            scores = reference_scores(pixels, target.pixels, target.mask, coverage=target.exact)
+            for metric, value in scores.items():
+                recorded = old.scores.get(metric)
+                if recorded is None or abs(recorded - value) > CROSS_TOLERANCE:
+                    what = f"frame {old.frame}, {metric} by scikit-image"
+                    found.append(Discrepancy(name, what, repr(recorded), repr(value)))
+            self.cross_checked += 1
+        return found
 
 
-def _compare_frame(name: str, old: FrameResult, new: FrameResult) -> list[Discrepancy]:
-    place = f"frame {old.frame}"
-    found = []
+def _frame_differences(name: str, old: FrameResult, new: FrameResult) -> list[Discrepancy]:
+    place, found = f"frame {old.frame}", []
     if (old.failure is None) != (new.failure is None):
-        found.append(
-            Discrepancy(name, f"{place}, failure", old.failure or "none", new.failure or "none")
-        )
-    found += [
-        Discrepancy(name, f"{place}, {metric}", "not there", repr(value))
-        for metric, value in new.scores.items()
-        if metric not in old.scores and metric not in _with_weights()
-    ]
-    for metric, value in old.scores.items():
-        again = new.scores.get(metric)
-        if again is None and metric not in _with_weights():
-            found.append(Discrepancy(name, f"{place}, {metric}", repr(value), "no such metric"))
-        elif again is not None and abs(again - value) > TOLERANCE:
-            found.append(Discrepancy(name, f"{place}, {metric}", repr(value), repr(again)))
+        texts = old.failure or "none", new.failure or "none"
+        found.append(Discrepancy(name, f"{place}, failure", *texts))
+    for metric in [*(name for name in new.scores if name not in old.scores), *old.scores]:
+        before, again = old.scores.get(metric), new.scores.get(metric)
+        if before is not None and again is not None:
+            if abs(again - before) > TOLERANCE:
+                what = f"{place}, {metric}"
+                found.append(Discrepancy(name, what, repr(before), repr(again)))
+        elif metric not in _with_weights():
+            recorded = "not there" if before is None else repr(before)
+            now = "no such metric" if again is None else repr(again)
+            found.append(Discrepancy(name, f"{place}, {metric}", recorded, now))
     return found
 
 
@@ -267,12 +293,203 @@ def _with_weights() -> set[str]:
     return {facts.name for facts in METRICS if facts.weights is not None}
 
 
+# --- a second opinion: nothing of `hwp_bench.metrics` is used but the protocol's settings, so that
+# a fault of the toolkit's formulas cannot hide in both numbers
+
+
+def sample_frames(count: int) -> list[int]:
+    """Return the positions of at most `CROSS_SAMPLE` frames, evenly spread."""
+    return evenly(count, CROSS_SAMPLE).tolist()
+
+
+def reference_scores(
+    prediction: np.ndarray,
+    target: np.ndarray,
+    mask: np.ndarray,
+    *,
+    coverage: bool,
+    protocol: Protocol = HWP_V1,
+) -> dict[str, float]:
+    """Compute PSNR (dB, at most `protocol.psnr_cap`) and SSIM of the scored pixels by scikit-image.
+
+    Everything off them is black in both images, (H, W, 3) uint8 sRGB; `mask` is (H, W) uint8, the
+    data set's own visible-hand mask, which may be exact coverage. The settings are those of Wang
+    et al. (2004), with a Gaussian window (docs/protocol.md).
+    """
+    from skimage.metrics import structural_similarity
+
+    region = _scored_region(mask, protocol.mask_erosion, coverage)
+    # Black beyond the frame, where scikit-image would mirror the image; only the part of the frame
+    # that the windows of scored pixels reach.
+    settings = protocol.ssim
+    border = 2 * settings.radius
+    rows, columns = (np.flatnonzero(region.any(axis=axis)) for axis in (1, 0))
+    part = (
+        slice(int(rows[0]), int(rows[-1]) + 2 * border + 1),
+        slice(int(columns[0]), int(columns[-1]) + 2 * border + 1),
+    )
+    inside = np.pad(region, border)[part]
+    x, y = (
+        np.pad(np.where(region[..., None], as_float(image), 0.0), ((border,) * 2,) * 2 + ((0, 0),))[
+            part
+        ]
+        for image in (prediction, target)
+    )
+    _, similarity = structural_similarity(
+        x,
+        y,
+        full=True,
+        channel_axis=2,
+        gaussian_weights=True,
+        sigma=settings.sigma,
+        use_sample_covariance=settings.sample_covariance,
+        data_range=settings.data_range,
+        K1=settings.k1,
+        K2=settings.k2,
+    )
+    return {
+        "psnr": _psnr(x[inside], y[inside], protocol.psnr_cap),
+        "ssim": float(similarity.mean(axis=2)[inside].mean()),
+    }
+
+
+def _scored_region(mask: np.ndarray, erosion: int, coverage: bool) -> np.ndarray:
+    """(H, W) bool: the pixels that the hand covers fully."""
+    from skimage.morphology import dilation
+
+    if coverage:
+        return np.asarray(mask == 255)
+    # The hand's border is where the background reaches; the frame's border takes nothing away.
+    background = (mask <= 127).astype(np.uint8)
+    side = 2 * erosion + 1
+    return np.asarray(dilation(background, np.ones((side, side), np.uint8)) == 0)
+
+
+def _psnr(x: np.ndarray, y: np.ndarray, cap: float) -> float:
+    from skimage.metrics import peak_signal_noise_ratio
+
+    # scikit-image divides by zero where the images are equal.
+    if np.array_equal(x, y):
+        return cap
+    value = float(peak_signal_noise_ratio(y, x, data_range=1.0))
+    return cap if math.isnan(value) else min(cap, value)
+
+
+# --- what no pixel decides
+
+
+def _label_differences(record: CaptureResult, capture: Capture, exact: bool) -> list[Discrepancy]:
+    """Compare what a result says of a capture with what the capture says of itself."""
+    info = capture.info
+    wanted = {
+        "hands": info.hands,
+        "perturbations": list(info.perturbations),
+        "exact_masks": exact,
+        "made_by": info.made_by,
+    }
+    return [
+        Discrepancy(record.id, name, _brief(getattr(record, name)), _brief(value))
+        for name, value in wanted.items()
+        if getattr(record, name) != value
+    ]
+
+
+def _key_differences(
+    results: Results, record: CaptureResult, capture: Capture | None
+) -> list[Discrepancy]:
+    """Compute the key of a capture again: it binds method, settings, seed, budget and protocols."""
+    clip = None if capture is None or capture.free_view is None else capture.free_view.digest
+    # A clip that was made after the evaluation is in no key of it.
+    clips = {None, clip} if record.free_view is None else {record.free_view.digest}
+    if record.key in {key_of(results, record, digest) for digest in clips}:
+        return []
+    found = "another: method, settings, seed, budget, frames, protocols or metrics were changed"
+    return [Discrepancy(record.id, "key", record.key, found)]
+
+
+def _suite_differences(
+    results: Results, captures: Sequence[Capture], *, own_splits: bool = False
+) -> list[Discrepancy]:
+    """Compare a result with the suite that it names: captures, splits, frames and scenes."""
+    if results.suite not in suite_names():
+        return []
+    problems = find_other_captures(results) if own_splits else find_missing(results)
+    foreign = [item.info.id for item in captures if not is_of_suite(item.info, results.suite)]
+    if foreign:
+        problems.append(f"is of other scenes or sizes: {', '.join(foreign)}")
+    return [Discrepancy("", "suite", results.suite, problem) for problem in problems]
+
+
+def digest_differences(value: Mapping[str, Any], *, expected: bool) -> list[Discrepancy]:
+    """Compare a result file with the digest that it states of its own content."""
+    stated, found = content_digest(value)
+    if stated == found or (stated is None and not expected):
+        return []
+    return [Discrepancy("", "digest", _brief(stated), found)]
+
+
+def copy_differences(root: Path, value: Mapping[str, Any], name: str) -> list[Discrepancy]:
+    """Compare each capture of a result file with the copy of it next to its predictions."""
+    found = []
+    for record in value["captures"]:
+        place = f"captures/{record['id']}/{name}"
+        try:
+            path = inside(root, place)
+            if not path.is_file():
+                continue
+            copy = read_json(path, max_bytes=MAX_BYTES)
+        except HwpError as error:
+            found.append(Discrepancy(record["id"], name, "a copy of this capture", error.problem))
+            continue
+        copy = copy if isinstance(copy, dict) else {}
+        odd = [key for key in {*record, *copy} if record.get(key) != copy.get(key)]
+        found += [
+            Discrepancy(
+                record["id"], f"{name}, {key}", _brief(record.get(key)), _brief(copy.get(key))
+            )
+            for key in sorted(odd)
+        ]
+    return found
+
+
+def _table_differences(root: Path, results: Results) -> list[Discrepancy]:
+    """Make the tables that an evaluation wrote next to its result again, and compare them."""
+    try:
+        tables = {**all_tables([results]), **free_view_tables([results])}
+    except HwpError as error:
+        return [Discrepancy("", "tables", "tables of the result", error.problem)]
+    found = []
+    for what, table, ending in [
+        (f"tables/{name}.{ending}", table, ending)
+        for name, table in tables.items()
+        for ending in FORMATS
+    ]:
+        made = format_table(table, ending)
+        try:
+            path = inside(root, what)
+            text = path.read_text("utf-8") if path.is_file() else made
+        except (HwpError, OSError, UnicodeDecodeError):
+            text = ""
+        if text != made:
+            lines = zip_longest(text.splitlines(), made.splitlines(), fillvalue="")
+            first = ((a[:_SHOWN], b[:_SHOWN]) for a, b in lines if a != b)
+            found.append(Discrepancy("", what, *next(first, ("", "other line ends"))))
+    return found
+
+
+def _brief(value: Any) -> str:
+    text = value if isinstance(value, str) else json.dumps(value)
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
+
+
 def _notes(results: Results, networks: Mapping[str, Network]) -> list[str]:
     notes = []
     here = metric_names(networks=networks)
     absent = [name for name in results.metrics if name in _with_weights() and name not in here]
     if absent:
-        notes.append(f"Not recomputed, because their weights are missing: {', '.join(absent)}.")
+        notes.append(
+            f"Not recomputed, because their weights are missing: {', '.join(absent)}."
+        )
     if results.toolkit != __version__:
         notes.append(f"Made with version {results.toolkit}; this is {__version__}.")
     mine = environment()
@@ -297,6 +514,6 @@ def _notes(results: Results, networks: Mapping[str, Network]) -> list[str]:
     return notes
 
 
-def _brief(protocols: Mapping[str, Any]) -> str:
+def _digests(protocols: Mapping[str, Any]) -> str:
     digests = [f"{name} {sha256_json(value)[:12]}" for name, value in sorted(protocols.items())]
     return ", ".join(digests) or "none"

@@ -15,24 +15,23 @@ from pathlib import Path
 from hwp_bench.base.console import notice
 from hwp_bench.base.errors import BadResult, HwpError, UsageError
 from hwp_bench.base.files import read_json
-from hwp_bench.evaluation.bindings import Discrepancy, copy_differences, digest_differences
-from hwp_bench.evaluation.capture_evaluation import RESULT
-from hwp_bench.evaluation.completeness import wrong_labels
-from hwp_bench.evaluation.evaluation_key import key_of
-from hwp_bench.leaderboard.entries import Entry, entry_files, read_checks, read_entry
-from hwp_bench.leaderboard.names import check_names, read_names
-from hwp_bench.leaderboard.records import Check
+from hwp_bench.evaluation.capture_evaluation import RESULT, key_of
+from hwp_bench.evaluation.sentences import find_wrong_labels
+from hwp_bench.evaluation.verify import Discrepancy, copy_differences, digest_differences
+from hwp_bench.leaderboard.entries import Check, Entry, entry_files, read_checks, read_entry
 from hwp_bench.leaderboard.rules import (
     check_entries,
+    check_names,
     check_revisions,
     off_the_data,
+    read_names,
     source_of,
     tables_of,
 )
 from hwp_bench.leaderboard.suite_data import CaptureData, known_data
 from hwp_bench.metrics import HWP_V1, metric_names, penalty
 from hwp_bench.results import CaptureResult
-from hwp_bench.results.bounds import MAX_BYTES
+from hwp_bench.results.schema import MAX_BYTES
 
 #: By how much a fit may last longer than the process around it, s: two clocks.
 _CLOCKS = 1e-3
@@ -53,7 +52,7 @@ def check_bound(entry: Entry) -> None:
     """
     if entry.protocol != HWP_V1.name:
         return
-    if problems := wrong_labels(entry.results):
+    if problems := find_wrong_labels(entry.results):
         raise _wrong(entry, "captures", "; ".join(problems))
     known = known_data().suites.get(entry.results.suite, {})
     for capture in entry.results.captures:

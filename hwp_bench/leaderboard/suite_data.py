@@ -16,7 +16,7 @@ from hwp_bench.base.files import cache_root, read_json, write_json
 from hwp_bench.base.packages import data_folder
 from hwp_bench.base.records import Digest, Line, parse_record, without_schema
 from hwp_bench.capture import open_capture
-from hwp_bench.evaluation.completeness import is_of_suite
+from hwp_bench.evaluation.sentences import is_of_suite
 from hwp_bench.results import Results
 from hwp_bench.sim.produce.production import RENDERER
 from hwp_bench.sim.produce.suites import suite_names

@@ -49,14 +49,7 @@ def method_digest(root: Path) -> str:
 
 
 def method_files(root: Path) -> dict[str, str]:
-    """Return the SHA-256 (hex) of each file and link of a method by its name below the folder.
-
-    Args:
-        root: the method's folder.
-
-    Raises:
-        BadInput: as `method_digest`.
-    """
+    """Return the SHA-256 (hex) of each file and link of a method by its name below the folder."""
     return _digests(root, own=True)
 
 
@@ -73,13 +66,6 @@ def exposed_digest(paths: Iterable[Path]) -> str:
     """SHA-256 (hex) of everything that a method may read besides its own folder.
 
     The place does not count, so that the same files give the same digest on every machine.
-
-    Args:
-        paths: files and folders, in the order in which they were named. One that is missing
-            counts as empty.
-
-    Raises:
-        BadInput: as `method_digest`.
     """
     parts = [
         _file_digest(path) if path.is_file() else digest_of(_digests(path, own=False))
@@ -117,10 +103,6 @@ def is_foreign(folder: str | os.PathLike[str], names: Collection[str]) -> bool:
 
     A capture and a results file are known by what they begin with, an output that is not finished
     by its lock file or its temporary name. A method behind walls finds such folders empty.
-
-    Args:
-        folder: the folder.
-        names: of what it holds.
     """
     if _TEMPORARY.fullmatch(os.path.basename(folder)) or LOCK in names:
         return True
@@ -137,17 +119,7 @@ def _marked(path: str) -> bool:
 
 
 def refuse_links_out(root: Path, exposed: Iterable[Path]) -> None:
-    """Refuse a method with a link to something that is in no digest.
-
-    Args:
-        root: the method's folder.
-        exposed: files and folders that the method is shown besides, which have a digest.
-
-    Raises:
-        BadMethod: a link leads out of the folder, and not into what is exposed; or into a folder
-            that the digest leaves out.
-        BadInput: a folder cannot be read.
-    """
+    """Refuse a method with a link to something that is in no digest."""
     top = root.resolve()
     shown = [path.resolve() for path in exposed]
     for name, entry in _entries(root, own=True):
@@ -205,15 +177,7 @@ def _file_digest(path: Path) -> str:
 
 
 def _entries(root: Path, *, own: bool) -> Iterator[tuple[str, os.DirEntry[str]]]:
-    """Yield the name below a folder and the entry of each regular file and link in it.
-
-    Args:
-        root: the folder.
-        own: it is a method's, whose digest leaves folders out.
-
-    Raises:
-        BadInput: a folder cannot be read, or there is too much in it.
-    """
+    """Yield the name below a folder and the entry of each regular file and link in it."""
     waiting, count, size = [root], 0, 0
     while waiting:
         folder = waiting.pop()

@@ -1,10 +1,11 @@
-"""Method directories: finding them, reading and checking `method.toml`."""
+"""Method directories: finding them, reading and checking `method.toml`, and settings against it."""
 
 from __future__ import annotations
 
+import importlib
 import itertools
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -35,8 +36,6 @@ MANIFEST = "method.toml"
 MAX_BYTES = 64 * 1024
 #: Preset that is used when none is asked for.
 DEFAULT_PRESET = "default"
-#: Ways to enter a method; a manifest has exactly one.
-ENTRY_KINDS = ("python", "command", "predictions")
 
 
 def _matching(pattern: str, description: str) -> Meta:
@@ -69,20 +68,53 @@ _SwitchSettings = Annotated[
 
 
 @dataclass(frozen=True)
+class Entry:
+    """How a method is entered, in one of three ways."""
+
+    #: `module:callable`.
+    python: _PythonEntry | None = None
+    #: The words of a command.
+    command: _Words | None = None
+    #: The folder of predictions.
+    predictions: str | None = None
+
+    def __post_init__(self) -> None:
+        if sum(value is not None for value in vars(self).values()) != 1:
+            raise UsageError(f"must have exactly one of {', '.join(vars(self))}")
+
+
+@dataclass(frozen=True)
 class Switch:
     """One component of a method that can be taken out, or one alternative to how it works."""
 
-    #: Short name: lower-case letters, digits, `-`.
+    #: Short name: lower-case letters, digits, `-`; the file has it as the name of the table.
     name: str
-    #: Name in tables.
-    title: str
+    #: Name in tables; its short name where the file does not say.
+    title: Line = ""
     #: One sentence.
-    description: str
-    #: Settings that override the preset in the switch's variant.
-    settings: Mapping[str, Any]
-    #: False: the variant lacks a component (`settings_off`). True: an alternative takes the place
-    #: of what the method does otherwise (`settings_on`).
-    alternative: bool
+    description: Line = ""
+    #: Settings that override the preset in its variant: those that take a component out, or those
+    #: that put an alternative in the place of what the method does otherwise.
+    settings_off: _SwitchSettings | None = None
+    settings_on: _SwitchSettings | None = None
+
+    def __post_init__(self) -> None:
+        if (self.settings_off is None) == (self.settings_on is None):
+            raise UsageError(
+                "must have exactly one of settings_off and settings_on",
+                remedy="settings_off takes a component out; settings_on puts an alternative in.",
+            )
+        object.__setattr__(self, "title", self.title or self.name)
+
+    @property
+    def alternative(self) -> bool:
+        """Whether it puts an alternative in; else it takes a component out."""
+        return self.settings_on is not None
+
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        """Settings that override the preset in its variant."""
+        return self.settings_on or self.settings_off or {}
 
     @property
     def variant_name(self) -> str:
@@ -91,41 +123,49 @@ class Switch:
 
 
 @dataclass(frozen=True)
-class MethodManifest:
-    """A checked `method.toml`."""
+class ManifestFields:
+    """The fields of a `method.toml`, but for its schema; what is empty the file does not say."""
+
+    #: Short name: letters, digits, `.`, `_`, `-`.
+    name: _MethodName
+    #: How it is entered.
+    entry: Entry
+    #: Name in tables; the short name where the file does not say.
+    title: Line = ""
+    #: One sentence about the method.
+    description: Line = ""
+    #: Who made it, its terms of use, its page.
+    authors: Line = ""
+    licence: Line = ""
+    url: Line = ""
+    #: Names of its settings, dotted within tables. A name stands for everything below it, and
+    #: `module:Class` for the fields of a dataclass.
+    settings: list[_SettingsItem] = field(default_factory=list)
+    #: Settings whose value may be `KIND:PATH`, a file or folder of a person's: the kinds, by name.
+    #: What a person sets this way needs no `--expose`. A preset exposes nothing: it comes with
+    #: the method.
+    files: dict[_SettingName, list[_KindName]] = field(default_factory=dict)
+    #: `module:callable` that checks such files before a method that ships is run.
+    check_files: _PythonEntry | None = None
+    #: Settings by preset.
+    presets: dict[str, dict[str, Any]] = field(default_factory=dict)
+    #: Components and alternatives for ablations, by name, in the order of the file.
+    switches: dict[_SwitchName, Switch] = field(default_factory=dict)
+    #: Names of the components that an ablation crosses when nothing is asked for.
+    crossed: Annotated[list[_SwitchName], Meta(max_length=4)] = field(default_factory=list)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MethodManifest(ManifestFields):
+    """A checked `method.toml`; all its `settings` are names."""
 
     #: The method directory.
     root: Path
-    #: Short name: letters, digits, `.`, `_`, `-`.
-    name: str
-    #: Name in tables.
-    title: str
-    #: One sentence about the method.
-    description: str
-    #: `python`, `command` or `predictions`.
-    kind: str
-    #: `module:callable`; or the words of a command; or the folder of predictions.
-    entry: str | tuple[str, ...]
-    #: Settings by preset.
-    presets: Mapping[str, Mapping[str, Any]]
-    #: Components and alternatives for ablations, by name, in the order of the file.
-    switches: Mapping[str, Switch] = field(default_factory=dict)
-    #: Names of the components that an ablation crosses when nothing is asked for; empty where
-    #: the file does not say.
-    crossed: tuple[str, ...] = ()
-    #: Who made it; empty where the file does not say.
-    authors: str = ""
-    #: Terms of use; empty where the file does not say.
-    licence: str = ""
-    #: Its page; empty where the file does not say.
-    url: str = ""
-    #: Names of its settings, dotted within tables; empty where the file does not say. A name
-    #: stands for everything below it.
-    settings: tuple[str, ...] = ()
-    #: Settings whose value may be `KIND:PATH`, a file or folder of a person's: the kinds, by name.
-    files: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    #: `module:callable` that checks such files before a method that ships is run; may be empty.
-    check_files: str = ""
+
+    @property
+    def kind(self) -> str:
+        """`python`, `command` or `predictions`."""
+        return next(kind for kind, value in vars(self.entry).items() if value is not None)
 
     def check_setting_names(self, values: Mapping[str, Any], field: str = "settings") -> None:
         """Refuse a setting that the method does not have, before anything runs.
@@ -156,13 +196,6 @@ class MethodManifest:
 
         Such a method takes any name, so that a mistyped one would run without an effect. A name
         that resembles none is let through, and said.
-
-        Args:
-            values: a person's settings by name.
-            field: where they come from, for the message.
-
-        Raises:
-            BadMethod: a name is nearly, but not, one that a preset or switch has.
         """
         tables = [*self.presets.values(), *(switch.settings for switch in self.switches.values())]
         known = {name for table in tables for name, _ in flattened(table)}
@@ -282,131 +315,106 @@ def read_manifest(path: str | os.PathLike[str]) -> MethodManifest:
         fields["authors"] = ", ".join(authors)
     if isinstance(fields.get("settings"), str):
         fields["settings"] = [fields["settings"]]
-    table = parse_record(_Manifest, fields, where=where, error=BadMethod)
-    kind, entry = table.entry.given[0]
+    switches = fields.get("switches")
+    if isinstance(switches, dict) and all(isinstance(item, dict) for item in switches.values()):
+        fields["switches"] = {name: {**item, "name": name} for name, item in switches.items()}
+    table = parse_record(ManifestFields, fields, where=where, error=BadMethod)
+    names = [
+        name
+        for item in table.settings
+        for name in (class_settings(root, item) if ":" in item else [item])
+    ]
+    known = {**vars(table), "settings": names, "title": table.title or table.name}
+    manifest = MethodManifest(**known, root=root)
     if table.entry.predictions is not None:
         inside(root, table.entry.predictions)
-    _check_plain(table.presets, where, "presets")
-    manifest = MethodManifest(
-        root=root,
-        name=table.name,
-        title=table.name if table.title is None else table.title,
-        description=table.description,
-        kind=kind,
-        entry=tuple(entry) if isinstance(entry, list) else entry,
-        presets=table.presets,
-        switches=_switches(table.switches, where),
-        crossed=tuple(table.crossed),
-        authors=table.authors,
-        licence=table.licence,
-        url=table.url,
-        settings=_setting_names(root, table.settings),
-        files={name: tuple(kinds) for name, kinds in table.files.items()},
-        check_files=table.check_files or "",
-    )
     manifest.check_setting_names(manifest.files, "files")
-    for name, preset in manifest.presets.items():
-        manifest.check_setting_names(preset, f"presets.{name}")
+    tables: dict[str, Mapping[str, Any]] = {
+        f"presets.{name}": preset for name, preset in manifest.presets.items()
+    }
     for name, switch in manifest.switches.items():
-        manifest.check_setting_names(switch.settings, f"switches.{name}")
-    _check_crossed(manifest, where)
+        kind = "settings_on" if switch.alternative else "settings_off"
+        tables[f"switches.{name}.{kind}"] = switch.settings
+    for place, values in tables.items():
+        check_json_values(values, where=where, field=place, error=BadMethod)
+        manifest.check_setting_names(values, place)
+    _check_switches(manifest, where)
     return manifest
 
 
-def _setting_names(root: Path, items: list[str]) -> tuple[str, ...]:
-    """Return the names of settings; an item `module:Class` stands for the fields of a dataclass."""
-    return tuple(
-        name for item in items for name in (class_settings(root, item) if ":" in item else [item])
-    )
-
-
-def _check_crossed(manifest: MethodManifest, where: Path) -> None:
-    """Refuse names in `crossed` that do not name a component, or are there twice."""
+def _check_switches(manifest: MethodManifest, where: Path) -> None:
+    """Refuse variants of one name, and names in `crossed` of no component, or there twice."""
+    variants = [switch.variant_name for switch in manifest.switches.values()]
+    for name in variants:
+        if variants.count(name) > 1:
+            raise BadMethod(f"two switches make a variant {name!r}", where=where, field="switches")
     components = [item.name for item in manifest.switches.values() if not item.alternative]
     for name in manifest.crossed:
         if name not in components or manifest.crossed.count(name) > 1:
+            twice = "there twice" if name in components else "not a component"
             raise BadMethod(
-                f"{name!r} is there twice"
-                if name in components
-                else f"{name!r} is not a component",
+                f"{name!r} is {twice}",
                 where=where,
                 field="crossed",
                 remedy=f"Name each of these at most once: {', '.join(components) or 'none'}.",
             )
 
 
-def _switches(tables: Mapping[str, _SwitchTable], where: Path) -> dict[str, Switch]:
-    switches = {}
-    for name, table in tables.items():
-        kind = "settings_on" if table.settings_off is None else "settings_off"
-        settings = getattr(table, kind)
-        _check_plain(settings, where, f"switches.{name}.{kind}")
-        title = name if table.title is None else table.title
-        switches[name] = Switch(
-            name, title, table.description, settings, alternative=kind == "settings_on"
+def find_setting_files(
+    manifest: MethodManifest, values: Mapping[str, Any]
+) -> tuple[dict[str, Any], tuple[Path, ...]]:
+    """Make the paths in a person's settings absolute, since a method runs in another folder."""
+    found: list[Path] = []
+
+    def resolve(table: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+        made: dict[str, Any] = {}
+        for name, value in table.items():
+            full = f"{prefix}{name}"
+            if isinstance(value, Mapping):
+                made[name] = resolve(value, f"{full}.")
+            elif isinstance(value, str):
+                made[name] = _absolute(manifest.files.get(full, []), full, value, found)
+            else:
+                made[name] = value
+        return made
+
+    return resolve(values, ""), tuple(dict.fromkeys(found))
+
+
+def check_settings(
+    manifest: MethodManifest, values: Mapping[str, Any], field: str = "settings"
+) -> None:
+    """Refuse settings that cannot work, before anything is rendered or run.
+
+    Names are checked, and files that settings name must be there. What a method that ships has to
+    say of those files (`check_files` in its `method.toml`) is asked too. Of another method
+    nothing is imported here: its code runs in the sandbox only.
+    """
+    manifest.check_setting_names(values, field)
+    manifest.doubt_setting_names(values, field)
+    resolved, files = find_setting_files(manifest, values)
+    if files and manifest.check_files and ships(manifest.root):
+        module, _, function = manifest.check_files.partition(":")
+        getattr(importlib.import_module(module), function)(resolved)
+
+
+def _absolute(kinds: Sequence[str], name: str, value: str, found: list[Path]) -> str:
+    kind, colon, place = value.partition(":")
+    if not colon or kind not in kinds:
+        return value
+    path = Path(os.path.abspath(Path(place).expanduser()))
+    if not place or not path.exists():
+        raise UsageError(
+            "does not exist" if place else "names no file",
+            where=path if place else None,
+            field=name,
+            remedy=f"Give {kind}:PATH with a file or folder of yours; nothing is downloaded.",
         )
-    names = [switch.variant_name for switch in switches.values()]
-    for name in names:
-        if names.count(name) > 1:
-            raise BadMethod(f"two switches make a variant {name!r}", where=where, field="switches")
-    return switches
+    found.append(path)
+    return f"{kind}:{path}"
 
 
-def _check_plain(value: Any, where: Path, field: str) -> None:
-    check_json_values(value, where=where, field=field, error=BadMethod)
-
-
-@dataclass(frozen=True)
-class _Entry:
-    """The table `entry` of the file."""
-
-    python: _PythonEntry | None = None
-    command: _Words | None = None
-    predictions: str | None = None
-
-    def __post_init__(self) -> None:
-        if len(self.given) != 1:
-            raise UsageError(f"must have exactly one of {', '.join(ENTRY_KINDS)}")
-
-    @property
-    def given(self) -> list[tuple[str, Any]]:
-        """Kind and value of every entry that the file has."""
-        values = (self.python, self.command, self.predictions)
-        pairs = zip(ENTRY_KINDS, values, strict=True)
-        return [(kind, value) for kind, value in pairs if value is not None]
-
-
-@dataclass(frozen=True)
-class _SwitchTable:
-    """One table of `switches` of the file."""
-
-    title: Line | None = None
-    description: Line = ""
-    settings_off: _SwitchSettings | None = None
-    settings_on: _SwitchSettings | None = None
-
-    def __post_init__(self) -> None:
-        if (self.settings_off is None) == (self.settings_on is None):
-            raise UsageError(
-                "must have exactly one of settings_off and settings_on",
-                remedy="settings_off takes a component out; settings_on puts an alternative in.",
-            )
-
-
-@dataclass(frozen=True)
-class _Manifest:
-    """The fields of the file, but for its schema."""
-
-    name: _MethodName
-    entry: _Entry
-    title: Line | None = None
-    description: Line = ""
-    authors: Line = ""
-    licence: Line = ""
-    url: Line = ""
-    settings: list[_SettingsItem] = field(default_factory=list)
-    files: dict[_SettingName, list[_KindName]] = field(default_factory=dict)
-    check_files: _PythonEntry | None = None
-    presets: dict[str, dict[str, Any]] = field(default_factory=dict)
-    switches: dict[_SwitchName, _SwitchTable] = field(default_factory=dict)
-    crossed: Annotated[list[_SwitchName], Meta(max_length=4)] = field(default_factory=list)
+def ships(root: Path) -> bool:
+    """Return whether a method directory is one that ships with the toolkit."""
+    places = (PACKAGES / "wildghand", data_folder("baselines"))
+    return any(root.resolve().is_relative_to(place.resolve()) for place in places)

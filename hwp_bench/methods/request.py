@@ -1,21 +1,23 @@
-"""The folder that a method is given: everything it may see of a capture, and nothing more.
+"""The frames, masks and hands that a method is given of a capture: its own, or an oracle's.
 
-A request holds the training and validation frames with their masks, and for every frame,
-test frames included, the estimated hand parameters and the cameras. It holds no test pixel, no
-truth and no word about the perturbations. Of the free-view clip it holds parameters and cameras.
-
-The frames are those that were captured, or an oracle's choice of them
-(`hwp_bench/methods/material.py`).
+Oracles bound what a method can reach on a simulated capture. `clean` gives the clean version of
+every frame, `unperturbed-only` just those frames that nothing perturbs. `true:NAMES` replaces
+single estimates by the truth, so that an error budget can tell what each of them costs.
 """
 
 from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from hwp_bench.base.errors import BadInput
+import numpy as np
+
+from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.files import atomic_folder, read_json, write_json
 from hwp_bench.base.images import read_gray, read_rgb
 from hwp_bench.base.records import parse_record, without_schema
@@ -23,23 +25,174 @@ from hwp_bench.capture.schema import (
     CAMERAS,
     FREE_VIEW,
     HANDS,
+    IMAGE_FOLDERS,
     image_path,
     write_cameras,
     write_hands,
     write_subject_mesh,
 )
 from hwp_bench.capture.splits import Split
+from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.methods.contract import (
+    FRAME_CHOICES,
     REQUEST,
     TEMPLATE,
     RequestRecord,
     RunSettings,
     TrainingCapture,
 )
-from hwp_bench.methods.material import free_view_hands, gives_mesh, training_material
 
 if TYPE_CHECKING:
     from hwp_bench.capture import Capture
+
+
+#: The estimates that the truth can replace, by name, in the order of tables.
+ORACLE_INPUTS: Mapping[str, str] = MappingProxyType(
+    {
+        "pixels": "clean versions of the training frames, with their masks",
+        "masks": "exact masks of the visible hand in the training frames",
+        "poses": "pose and translation in the training frames",
+        "test-poses": "pose and translation in the frames that are rendered",
+        "betas": "shape parameters",
+        "mesh": "the subject's own rest mesh and joints, in place of the hand model's template",
+    }
+)
+_PREFIX = "true:"
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingInputs:
+    """Where the training part of a request comes from."""
+
+    #: Indices of the training frames.
+    train: np.ndarray
+    #: Kind of image that is given as frames, a key of `IMAGE_FOLDERS`.
+    frames: str
+    #: Kind of image that is given as masks.
+    masks: str
+    #: Hand parameters by side.
+    hands: dict[str, HandParameters]
+
+
+def frame_choice(truths: Iterable[str]) -> str:
+    """The choice of frames in which the truth replaces some estimates."""
+    asked = set(truths)
+    return (
+        _PREFIX + ",".join(name for name in ORACLE_INPUTS if name in asked)
+        if asked
+        else "perturbed"
+    )
+
+
+def known_oracle_inputs(capture: Capture) -> tuple[str, ...]:
+    """The estimates of a capture whose truth is stored with it, in the order of `ORACLE_INPUTS`."""
+    known = set()
+    if capture.true_hands is not None:
+        known |= {"poses", "test-poses", "betas"}
+    if capture.has_true_masks:
+        known.add("masks")
+    if capture.has_true_template:
+        known.add("mesh")
+    if all((capture.root / IMAGE_FOLDERS[kind]).is_dir() for kind in ("clean", "clean_masks")):
+        known.add("pixels")
+    return tuple(name for name in ORACLE_INPUTS if name in known)
+
+
+def choose_training_inputs(capture: Capture, split: Split, choice: str) -> TrainingInputs:
+    """Return the training part that a method is given of a capture."""
+    if choice.startswith(_PREFIX):
+        return _with_truths(capture, split, _replaced_by(choice))
+    if choice not in FRAME_CHOICES:
+        raise UsageError(f"{choice!r} is not one of {', '.join(FRAME_CHOICES)}", field="frames")
+    hands = dict(capture.hands)
+    if choice == "perturbed":
+        return TrainingInputs(split.train, "frames", "masks", hands)
+    perturbed = _perturbed(capture)
+    if choice == "unperturbed-only":
+        train = split.train[~perturbed[split.train]]
+        if not len(train):
+            raise UsageError("has no unperturbed training frame", where=capture.root)
+        return TrainingInputs(train, "frames", "masks", hands)
+    truth = capture.true_hands
+    if truth is None or "pixels" not in known_oracle_inputs(capture):
+        raise UsageError(
+            "does not know its clean frames",
+            where=capture.root,
+            remedy="Only simulated captures do; use --frames perturbed.",
+        )
+    repaired = {side: _replaced(hand, truth[side], perturbed) for side, hand in hands.items()}
+    return TrainingInputs(split.train, "clean", "clean_masks", repaired)
+
+
+def choose_free_view_hands(clip: Capture, choice: str) -> dict[str, HandParameters]:
+    """Return the hand parameters of a free-view clip that a method is given."""
+    truth = clip.true_hands
+    # The subject's mesh has the true shape in it, and so belongs in the places of that shape.
+    exact = bool({"betas", "mesh"} & set(_replaced_by(choice)))
+    return dict(truth if exact and truth is not None else clip.hands)
+
+
+def replaces_mesh(choice: str) -> bool:
+    """Whether a choice of frames replaces the template by the subject's own mesh."""
+    return "mesh" in _replaced_by(choice)
+
+
+def _replaced_by(choice: str) -> list[str]:
+    """The estimates that a choice of frames replaces by the truth."""
+    return choice.removeprefix(_PREFIX).split(",") if choice.startswith(_PREFIX) else []
+
+
+def _with_truths(capture: Capture, split: Split, names: list[str]) -> TrainingInputs:
+    """The capture as it is, but for some estimates."""
+    known = known_oracle_inputs(capture)
+    for name in names:
+        if name not in ORACLE_INPUTS:
+            raise UsageError(f"{name!r} is not one of {', '.join(ORACLE_INPUTS)}", field="frames")
+        if name not in known:
+            raise UsageError(
+                f"does not know its true {name}",
+                where=capture.root,
+                remedy="Only simulated captures do.",
+            )
+    frames, masks = ("clean", "clean_masks") if "pixels" in names else ("frames", "masks")
+    if "masks" in names and "pixels" not in names:
+        masks = "true_masks"
+    rows = np.zeros(len(capture), dtype=bool)
+    if "poses" in names:
+        rows[split.train] = True
+    if "test-poses" in names:
+        rows[split.validation] = rows[split.test] = True
+    hands = dict(capture.hands)
+    for side, truth in (capture.true_hands or {}).items():
+        hands[side] = _replaced(hands[side], truth, rows)
+        if "betas" in names:
+            hands[side] = replace(hands[side], betas=truth.betas)
+    return TrainingInputs(split.train, frames, masks, hands)
+
+
+def _perturbed(capture: Capture) -> np.ndarray:
+    """(F,) bool, true where any perturbation acts."""
+    acts = np.zeros(len(capture), dtype=bool)
+    for name, severities in capture.info.perturbations.items():
+        if severities is None:
+            raise UsageError(
+                f"does not know in which frames {name} acts",
+                where=capture.root,
+                remedy="Use --frames perturbed.",
+            )
+        acts |= np.array(severities) > 0
+    return acts
+
+
+def _replaced(estimate: HandParameters, truth: HandParameters, rows: np.ndarray) -> HandParameters:
+    """The estimate with the truth's pose and translation in some frames, (F,) bool."""
+    return replace(
+        estimate,
+        pose=np.where(rows[:, None, None], truth.pose, estimate.pose),
+        transl=np.where(rows[:, None], truth.transl, estimate.transl),
+        valid=estimate.valid | (rows & truth.valid),
+    )
+
 
 #: Version of the request folder.
 SCHEMA = "hwp-request/1"
@@ -55,7 +208,7 @@ def write_request(path: Path, capture: Capture, split: Split, run: RunSettings) 
         UsageError: the capture does not know what `run.frames` asks for.
     """
     info = capture.info
-    material = training_material(capture, split, run.frames)
+    material = choose_training_inputs(capture, split, run.frames)
     with atomic_folder(path, overwrite=True) as root:
         for frame in [*material.train.tolist(), *split.validation.tolist()]:
             for kind, source_kind, read in (
@@ -70,14 +223,14 @@ def write_request(path: Path, capture: Capture, split: Split, run: RunSettings) 
                 shutil.copyfile(source, target)
         write_hands(root / HANDS, material.hands)
         write_cameras(root / CAMERAS, capture.cameras)
-        mesh = gives_mesh(run.frames)
+        mesh = replaces_mesh(run.frames)
         if mesh:
             own = {side: capture.true_template(side) for side in info.sides}
             write_subject_mesh(root / TEMPLATE, own)
         clip = capture.free_view
         if clip is not None:
             (root / FREE_VIEW).mkdir()
-            write_hands(root / FREE_VIEW / HANDS, free_view_hands(clip, run.frames))
+            write_hands(root / FREE_VIEW / HANDS, choose_free_view_hands(clip, run.frames))
             write_cameras(root / FREE_VIEW / CAMERAS, clip.cameras)
         description = {
             "schema": SCHEMA,

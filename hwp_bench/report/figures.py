@@ -1,4 +1,4 @@
-"""Every figure by matplotlib, as a file or in a page: score over seconds, bars by perturbation.
+"""Every figure by matplotlib, as a file or in a page: curves, bars, strips of captures.
 
 Figures are drawn in the colours of `PALETTE`. In a page each of them is a variable of the style
 sheet, so that a figure follows the light and the dark scheme.
@@ -6,26 +6,36 @@ sheet, so that a figure follows the light and the dark scheme.
 
 from __future__ import annotations
 
+import hashlib
 import io
+import re
 import warnings
+import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from markupsafe import Markup
 
-from hwp_bench.analysis.cost.analysis import CostAnalysis
-from hwp_bench.analysis.cost.curves import FrontPart, MeanCurve
-from hwp_bench.analysis.statistics.bootstrap import Estimate
+from hwp_bench.analysis.bootstrap import Estimate
+from hwp_bench.analysis.cost import CostAnalysis
+from hwp_bench.analysis.curves import FrontPart, MeanCurve
 from hwp_bench.base.files import atomic_write
 from hwp_bench.base.tables import write_tables
+from hwp_bench.capture.schema import CaptureInfo
 from hwp_bench.metrics import metric as metric_facts
+from hwp_bench.report.sources import TemporalWeights
+from hwp_bench.results import CaptureResult
+from hwp_bench.taxonomy import MAX_SEVERITY, perturbation
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
 
 #: Colours of figures: those of the style sheet's light scheme, by the name of its variable.
 PALETTE: Mapping[str, str] = {
@@ -318,3 +328,230 @@ def write_figure(folder: Path, name: str, figure: Figure) -> list[Path]:
             figure.savefig(stream, format=ending, dpi=DPI, facecolor="white", metadata=metadata)
             written.append(atomic_write(folder / f"{name}.{ending}", stream.getvalue()))
     return written
+
+
+def inline_svg(figure: Figure, title: str) -> Markup:
+    """Return a figure as an SVG element for a page: words stay words, colours are variables.
+
+    Args:
+        figure: the figure.
+        title: what it shows, for people who cannot see it.
+    """
+    stream = io.StringIO()
+    nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))
+    with figure_style(**{"svg.fonttype": "none"}):
+        figure.savefig(stream, format="svg", metadata=nothing)
+    text = stream.getvalue()
+    drawn = ET.fromstring(text)
+    # Two figures of one page must not share the names of their markers.
+    own = "f" + hashlib.sha256(f"{title}{text}".encode()).hexdigest()[:10] + "-"
+    box = drawn.attrib["viewBox"]
+    # matplotlib states these two in a style element, which would rule the whole page.
+    style = "stroke-linejoin:round;stroke-linecap:butt"
+    attributes = {"viewBox": box, "role": "img", "aria-label": title, "class": "plot"}
+    root = ET.Element("svg", {**attributes, "style": style})
+    ET.SubElement(root, "title").text = title
+    for child in drawn:
+        _take_over(root, child, own)
+    return Markup(ET.tostring(root, encoding="unicode"))
+
+
+def _take_over(parent: ET.Element, drawn: ET.Element, own: str) -> None:
+    """Copy an element without namespaces, clipping and names that nothing refers to."""
+    tag = drawn.tag.rpartition("}")[2]
+    if tag in ("style", "clipPath", "metadata"):
+        return
+    made = ET.SubElement(parent, tag)
+    for key, value in drawn.attrib.items():
+        name = key.rpartition("}")[2]
+        if name == "id":
+            if value.startswith(MARK):
+                made.set("class", value.removeprefix(MARK))
+            elif tag != "g":
+                made.set("id", own + value)
+        elif name == "href":
+            made.set("href", "#" + own + value.removeprefix("#"))
+        elif name == "style":
+            made.set("style", _page_style(value))
+        elif name != "clip-path" and not value.startswith("rotate(-0 "):
+            short = re.sub(r"-?\d+\.\d+", lambda found: f"{float(found[0]):.2f}", value)
+            made.set(name, " ".join(short.split()))
+    if tag == "text":
+        made.text = drawn.text
+    for child in drawn:
+        _take_over(made, child, own)
+    if tag in ("defs", "g") and not len(made):
+        parent.remove(made)
+
+
+def _page_style(style: str) -> str:
+    """Return a style with the page's own font, and its colours as variables."""
+    parts = [part for part in style.split("; ") if not part.startswith("font-family")]
+    variables = {color: f"var(--{name})" for name, color in PALETTE.items()}
+    return re.sub(r"#[0-9a-f]{6}", lambda found: variables.get(found[0], found[0]), ";".join(parts))
+
+
+#: Place of every panel, px: its left side and its width.
+_LEFT, _ACROSS = 44.0, WIDTH - 54.0
+#: Heights, px: the scores with their labels, the rail of the whole capture, a row of severities
+#: and one of unknown ones, a plot of temporal weights, and the labels under the last of them.
+_SCORES, _RAIL, _SEVERITY, _UNKNOWN, _WEIGHTS, _FOOT = 122.0, 30.0, 28.0, 16.0, 62.0, 16.0
+#: Most test frames that get a dot each.
+_DOTS = 60
+
+
+@dataclass(frozen=True)
+class StripMethod:
+    """One method on one capture."""
+
+    #: Number of the method, for its colour.
+    method: int
+    #: Its label.
+    label: str
+    #: Its result.
+    result: CaptureResult
+    #: Its temporal weights by side; empty where it left none.
+    weights: Mapping[str, TemporalWeights]
+
+
+def strip_plot(methods: Sequence[StripMethod], info: CaptureInfo | None, metric: str) -> Markup:
+    """Draw the strip of one capture.
+
+    Args:
+        methods: at least one; all with the same test frames.
+        info: the capture; None leaves severities out.
+        metric: of the scores.
+    """
+    frames = [frame.frame for frame in methods[0].result.frames]
+    weights = [(method, side) for method in methods for side in method.weights]
+    severities = dict(info.perturbations) if info else {}
+    rows = {name: _UNKNOWN if v is None else _SEVERITY for name, v in severities.items()}
+    seen = [max(method.weights[side].frames) for method, side in weights]
+    count = info.frame_count if info else max([*frames, *seen], default=0) + 1
+    below = info is not None or bool(weights)
+    height = _SCORES
+    if below:
+        height += _RAIL + sum(rows.values()) + _WEIGHTS * len(weights) + _FOOT
+    with figure_style():
+        figure = new_figure(height)
+        _draw_scores(figure, methods, frames, metric)
+        top, axes = _SCORES, None
+        if below:
+            axes = _draw_rail(figure, top, count, min(frames), max(frames) + 1)
+            top += _RAIL
+        for name, values in severities.items():
+            axes = _draw_severity(figure, top, name, values, count)
+            top += rows[name]
+        for method, side in weights:
+            axes = _draw_weights(figure, top, method, side, count)
+            top += _WEIGHTS
+        if axes is not None:
+            _number_frames(axes)
+        title = f"{metric_facts(metric).label} of the test frames of {methods[0].result.id}"
+        return inline_svg(figure, title)
+
+
+def _draw_scores(
+    figure: Figure, methods: Sequence[StripMethod], frames: Sequence[int], metric: str
+) -> None:
+    facts = metric_facts(metric)
+    axes = add_axes(figure, _LEFT, 16, _ACROSS, 88)
+    values = [frame.scores[metric] for method in methods for frame in method.result.frames]
+    span = max(max(values) - min(values), 10.0**-facts.digits)
+    scale_up(axes, min(values) - 0.1 * span, max(values) + 0.1 * span, 4)
+    for method in methods:
+        scores = [frame.scores[metric] for frame in method.result.frames]
+        style = series_style(method.method)
+        axes.plot(scores, **style)
+        failed = [bool(frame.failure) for frame in method.result.frames]
+        sound = [place for place, lost in enumerate(failed) if not lost]
+        if sound and len(scores) <= _DOTS:
+            heights = [scores[place] for place in sound]
+            axes.plot(sound, heights, "o", markersize=4.4, color=style["color"])
+        for place, lost in enumerate(failed):
+            if lost:
+                axes.text(place, scores[place], "✕", ha="center", va="center", size=13)
+    axes.set_xlim(-0.5, len(frames) - 0.5)
+    step = max(1, len(frames) // 6)
+    axes.set_xticks(range(0, len(frames), step), [str(frame) for frame in frames[::step]])
+    axes.tick_params(axis="x", labelbottom=True)
+    unit = f" [{facts.unit}]" if facts.unit else ""
+    heading(axes, f"{facts.label}{unit}, test frames")
+
+
+def _draw_rail(figure: Figure, top: float, count: int, low: int, high: int) -> Axes:
+    """Show where in the capture the test clip lies that is drawn large above."""
+    from matplotlib.patches import Polygon, Rectangle
+
+    axes = add_axes(figure, _LEFT, top, _ACROSS, 26)
+    axes.spines[:].set_visible(False)
+    axes.set(xlim=(0, count), ylim=(26, 0))
+    corners = [(0, 0), (count, 0), (high, 22), (low, 22)]
+    axes.add_patch(
+        Polygon(
+            corners, facecolor=PALETTE["shade"], edgecolor=PALETTE["line"], linewidth=0.7,
+            gid=f"{MARK}wedge",
+        )
+    )  # fmt: skip
+    for start, stop, name in ((0, count, "line"), (low, high, "test")):
+        patch = Rectangle((start, 22), stop - start, 4, linewidth=0, facecolor=PALETTE[name])
+        patch.set_gid(MARK + ("test" if name == "test" else "rail"))
+        axes.add_patch(patch)
+    return axes
+
+
+def _draw_severity(
+    figure: Figure, top: float, name: str, values: Sequence[int] | None, count: int
+) -> Axes:
+    from matplotlib.patches import Rectangle
+
+    axes = add_axes(figure, _LEFT, top + 14, _ACROSS, 2 if values is None else 10)
+    axes.spines["bottom"].set(color=PALETTE["line"], linewidth=0 if values is None else 0.7)
+    axes.set(xlim=(0, count), ylim=(0, 1))
+    known = f"severity 0 to {MAX_SEVERITY}" if values is not None else "severity unknown"
+    _caption(axes, f"{perturbation(name).title}, {known}")
+    start = 0
+    for severity, group in groupby(values or ()):
+        width = len(list(group))
+        if severity:
+            axes.add_patch(
+                Rectangle(
+                    (start, 0), width, 1, linewidth=0, facecolor=PALETTE["severity"],
+                    alpha=min(0.15 + 0.17 * severity, 1.0), gid=f"{MARK}severity",
+                )
+            )  # fmt: skip
+        start += width
+    return axes
+
+
+def _draw_weights(figure: Figure, top: float, method: StripMethod, side: str, count: int) -> Axes:
+    weights = method.weights[side]
+    axes = add_axes(figure, _LEFT, top + 14, _ACROSS, 44)
+    axes.spines["bottom"].set(color=PALETTE["line"], linewidth=0.7)
+    largest = max(weights.weights)
+    axes.set(xlim=(0, count), ylim=(0, largest or 1.0))
+    moments = [frame + 0.5 for frame in weights.frames]
+    axes.plot(moments, weights.weights, clip_on=False, **series_style(method.method))
+    where = f", {side} hand" if side else ""
+    _caption(axes, f"Temporal weight{where}, {method.label}: up to {largest:.3g}")
+    return axes
+
+
+def _caption(axes: Axes, text: str) -> None:
+    """Put a small line over axes."""
+    axes.annotate(
+        text, (0, 1), (0, 4), xycoords="axes fraction", textcoords="offset points",
+        color=PALETTE["faint"], annotation_clip=False,
+    )  # fmt: skip
+
+
+def _number_frames(axes: Axes) -> None:
+    """Put the numbers of the frames under the lowest panel."""
+    from matplotlib.ticker import MaxNLocator
+
+    axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10], integer=True, prune="lower"))
+    axes.tick_params(axis="x", labelbottom=True)
+    axes.annotate(
+        "frame", (0, 0), (-42, -3), xycoords="axes fraction", textcoords="offset points", va="top",
+        color=PALETTE["faint"], annotation_clip=False,
+    )  # fmt: skip

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from hwp_bench.analysis.statistics.pairing import MethodRuns
+from hwp_bench.analysis.pairing import MethodRuns
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.tables import Cell, Column, Table, without_empty_columns
 from hwp_bench.metrics import metric as metric_facts

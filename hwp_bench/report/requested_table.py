@@ -7,16 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from hwp_bench.analysis.statistics.pairing import group_runs
+from hwp_bench.analysis.pairing import group_runs
 from hwp_bench.base.errors import BadResult, UsageError
 from hwp_bench.base.files import inside, read_json
 from hwp_bench.base.tables import Table
-from hwp_bench.report.data_groups import DataGroup, data_groups, stacked
-from hwp_bench.report.evaluation_tables import all_tables, same_data
-from hwp_bench.report.free_view_table import free_view_table
-from hwp_bench.report.novelty_table import novelty_table
-from hwp_bench.report.outline_table import outline_table
-from hwp_bench.report.over_seeds import over_seeds
 from hwp_bench.report.paper_layouts import (
     DISTANCE,
     LAYOUTS,
@@ -27,25 +21,32 @@ from hwp_bench.report.paper_layouts import (
     layout_table,
     seeds_layout,
 )
-from hwp_bench.report.ranking_tables import cost_table, rank_table, winner_note
+from hwp_bench.report.pixel_tables import novelty_table, outline_table
 from hwp_bench.report.sources import (
+    DataGroup,
     ResultsSource,
+    data_groups,
     find_captures,
     open_captures_of,
     read_sources,
+    stacked,
 )
 from hwp_bench.report.study_tables import (
     LEVEL_NOTE,
     bias_rows,
     bias_table,
+    cost_table,
+    rank_table,
     refused_bias,
     robustness_table,
     seeds_table,
     severity_table,
+    winner_note,
 )
+from hwp_bench.report.tables import all_tables, free_view_table, over_seeds, same_data
 from hwp_bench.results import read_results
+from hwp_bench.results.schema import add_isolation_note
 from hwp_bench.results.store import ABLATION
-from hwp_bench.results.walls import noted
 
 #: The paper's table with the same content, by name of our table.
 PAPER_OF = {"overall": 3, "paper": 3, "perturbations": 5, "bias": 9, "seeds": 10}
@@ -106,7 +107,7 @@ def _ours(request: TableRequest) -> Table:
     for group in data_groups(sources, oracles=request.by == "robustness"):
         try:
             results = [source.results for source in group.sources]
-            tables.append(noted(_group_table(group.sources, request), results))
+            tables.append(add_isolation_note(_group_table(group.sources, request), results))
             shown.append(group)
         except UsageError as error:
             # Such as captures of unknown severity; other data may have what the table needs.
@@ -157,9 +158,9 @@ def _paper(number: int, request: TableRequest) -> Table:
     same_data(results)
     runs = group_runs(results)
     if number == 10:
-        return noted(seeds_layout(runs, request.published), results)
+        return add_isolation_note(seeds_layout(runs, request.published), results)
     if number == 9:
-        return noted(_bias_layout(sources, request), results)
+        return add_isolation_note(_bias_layout(sources, request), results)
     marks = _marks(request.paths) if number == 6 else None
     if number == 6 and runs and not marks:
         raise UsageError(
@@ -167,7 +168,9 @@ def _paper(number: int, request: TableRequest) -> Table:
             field="RESULTS",
             remedy="Give the folder that `hwp-bench ablate` wrote.",
         )
-    return noted(layout_table(LAYOUTS[number], runs, request.published, marks), results)
+    return add_isolation_note(
+        layout_table(LAYOUTS[number], runs, request.published, marks), results
+    )
 
 
 def _bias_layout(sources: Sequence[ResultsSource], request: TableRequest) -> Table:

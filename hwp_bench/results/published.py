@@ -81,11 +81,7 @@ class Published:
     datasets: list[Dataset]
 
     def table(self, number: int) -> PublishedTable:
-        """Return the table of that number.
-
-        Raises:
-            BadResult: it holds no measurements.
-        """
+        """Return the table of that number."""
         for table in self.tables:
             if table.number == number:
                 return table
@@ -93,15 +89,7 @@ class Published:
 
 
 def read_published(path: str | os.PathLike[str] | None = None) -> Published:
-    """Read published numbers.
-
-    Args:
-        path: the file; None takes the one that ships.
-
-    Raises:
-        BadInput: missing or no JSON.
-        BadResult: a field is missing, unknown or of the wrong type; it is named.
-    """
+    """Read published numbers."""
     file = Path(path) if path is not None else data_folder("leaderboard") / "published.json"
     value = read_json(file)
     return parse_record(Published, without_schema(value, SCHEMA, where=file), where=file)

@@ -1,30 +1,73 @@
-"""The records of a result file, and what is read off them.
-
-A field that was added within a version has a default, which says what files without it mean.
-"""
+"""How much a result may hold: sizes, and the range of each number, checked before it is used."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Annotated
+import json
+import math
+import os
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from importlib import metadata
+from typing import Annotated, Any
 
 from msgspec import Meta
 
+from hwp_bench.base import packages
 from hwp_bench.base.errors import UsageError
-from hwp_bench.base.files import canonical_json
+from hwp_bench.base.files import canonical_json, files_digest
 from hwp_bench.base.records import Count, Line, Message, Seconds, Seed
+from hwp_bench.base.tables import Table
+from hwp_bench.metrics import METRICS
 from hwp_bench.metrics.score import CaptureScores, Scores, aggregate
-from hwp_bench.results.bounds import (
-    MAX_CAPTURES,
-    MAX_CURVE,
-    MAX_FRAMES,
-    FreeTable,
-    Limits,
-    ScoreTable,
-    check_scores,
-    check_table,
-)
+
+#: Largest result file that is read, bytes; one of 10,000 frames stays far below it.
+MAX_BYTES = 64 << 20
+#: Most captures of a result, frames of a capture, and points of a curve.
+MAX_CAPTURES, MAX_FRAMES, MAX_CURVE = 1_000, 100_000, 10_000
+#: Most metrics of a frame.
+MAX_METRICS = 100
+#: Most characters of the settings, the protocols or the environment as JSON.
+MAX_TABLE = 500_000
+#: Shortest time that a rate is computed from, s; below it a clock has measured nothing.
+SHORTEST = 1e-9
+# By how much a score may leave the range of its metric: sums are rounded.
+_ROUNDING = 1e-9
+
+#: Scores by metric; a metric that the toolkit knows has its own range, which is narrower.
+ScoreTable = Annotated[
+    dict[Line, Annotated[float, Meta(ge=-1e6, le=1e6)]], Meta(max_length=MAX_METRICS)
+]
+_Limit = Annotated[str, Meta(pattern=r"\A(?:seconds|steps)\Z", description="seconds or steps")]
+#: Limits of a fit by name.
+Limits = dict[_Limit, Count | Seconds | None]
+#: A table of any values; `check_table` bounds all of it.
+FreeTable = dict[Line, Any]
+
+
+def check_scores(scores: Mapping[str, float]) -> None:
+    """Refuse scores that their metric cannot have."""
+    for facts in METRICS:
+        value = scores.get(facts.name)
+        low, high = facts.range
+        high = math.inf if high is None else high
+        if value is not None and not low - _ROUNDING <= value <= high + _ROUNDING:
+            limits = f"from {low:g} to {high:g}" if high < math.inf else f"at least {low:g}"
+            raise UsageError(
+                f"is {value:g}, but {facts.label} is {limits}", field=f"scores.{facts.name}"
+            )
+
+
+def check_table(value: Mapping[str, Any], name: str) -> None:
+    """Refuse a table of any values that is too large to be shown."""
+    if len(json.dumps(value)) > MAX_TABLE:
+        raise UsageError(f"holds more than {MAX_TABLE:,} characters", field=name)
+
+
+def per_second(count: int, seconds: float | None) -> float | None:
+    """Return a rate; None where no time was measured, or one too short to divide by."""
+    return None if seconds is None or seconds < SHORTEST else count / seconds
+
 
 # Longest text of a setting's value.
 _SHOWN = 40
@@ -248,12 +291,7 @@ def differing_makers(first: CaptureResult, second: CaptureResult) -> str:
 
 
 def differing_settings(results: Sequence[Results]) -> list[str]:
-    """Return for each result those of its settings in which results of its title differ.
-
-    Returns:
-        Texts such as `prior = "", steps = 300`, with `default` where a result says nothing; empty
-        where all settings are the same.
-    """
+    """Return for each result those of its settings in which results of its title differ."""
     texts = [
         {name: canonical_json(value) for name, value in result.method.settings.items()}
         for result in results
@@ -274,3 +312,116 @@ def differing_settings(results: Sequence[Results]) -> list[str]:
             )
         )
     return told
+
+
+#: What `CaptureResult.isolation` says of a run inside the walls.
+ISOLATED = "namespaces"
+#: What `Results.environment` says under `caches`: a run finds nothing that a method wrote before.
+NEW_CACHES = "new for each run"
+
+
+def unisolated_captures(results: Results) -> dict[str, list[str]]:
+    """Return the ids of the captures that a method ran on without walls, by the reason.
+
+    The reason is empty where a person asked for none. Predictions that came as files, and results
+    of versions that recorded nothing, are left out.
+    """
+    found: dict[str, list[str]] = {}
+    for capture in results.captures:
+        if capture.isolation is not None and capture.isolation != ISOLATED:
+            _, _, reason = capture.isolation.partition(" ")
+            found.setdefault(reason.strip("()"), []).append(capture.id)
+    return found
+
+
+def isolation_text(results: Results, head: str = "") -> str:
+    """Say how the method's process was isolated; empty where nothing is known of it."""
+    open_runs = unisolated_captures(results)
+    if not open_runs:
+        walled = any(capture.isolation == ISOLATED for capture in results.captures)
+        return f"isolation: {head}{ISOLATED}" if walled else ""
+    parts = [
+        ", ".join(ids) + (f" (the system refuses them: {reason})" if reason else "")
+        for reason, ids in open_runs.items()
+    ]
+    return (
+        f"warning: {head}no isolation on {'; '.join(parts)}. The method could read every file that "
+        "its user can read, test frames among them, and use the network. --isolation required "
+        "refuses to run without walls."
+    )
+
+
+def isolation_note(results: Sequence[Results]) -> str:
+    """Return a line under a table that names methods which ran without walls; empty if none did."""
+    titles = [one.method.title for one in results if unisolated_captures(one)]
+    names = ", ".join(dict.fromkeys(titles))
+    return f"Run without walls, where test frames can be read: {names}." if names else ""
+
+
+def add_isolation_note(table: Table, results: Sequence[Results]) -> Table:
+    """Return a table with `isolation_note` below it, once."""
+    note = isolation_note(results)
+    if not note or note in table.notes:
+        return table
+    return replace(table, notes=(*table.notes, note))
+
+
+#: Packages whose version can move a number.
+PACKAGES = (
+    "numpy",
+    "torch",
+    "numba",
+    "opencv-contrib-python-headless",
+    "scikit-image",
+    "OpenImageIO",
+    "scipy",
+    "trimesh",
+    "embreex",
+    "gsplat",
+    "lpips",
+)
+
+
+def environment() -> dict[str, Any]:
+    """Return the versions, the processor and the system; no host name and no path.
+
+    `code` is the digest of the toolkit's own modules, which a version number alone does not tell
+    while it is being developed. `caches` says what caches the methods began with.
+    """
+    versions = {}
+    for package in PACKAGES:
+        try:
+            versions[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            continue
+    return {
+        "python": platform.python_version(),
+        "system": f"{platform.system()} {platform.machine()}",
+        "processor": _processor(),
+        "cores": len(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity")
+        else os.cpu_count(),
+        "packages": versions,
+        "code": code_digest(),
+        "caches": NEW_CACHES,
+    }
+
+
+def code_digest() -> str:
+    """Return the SHA-256 (hex) of the toolkit's own modules: names and contents."""
+    root = packages.PACKAGES / "hwp_bench"
+    # The shipped methods lie in `_data` in a wheel and elsewhere in a checkout.
+    shipped = root / "_data"
+    modules = (path for path in root.rglob("*.py") if not path.is_relative_to(shipped))
+    return files_digest(root, modules)
+
+
+def _processor() -> str:
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as stream:
+            for line in stream:
+                if line.startswith("model name"):
+                    return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor() or "unknown"

@@ -13,8 +13,7 @@ from hwp_bench.base.errors import BadResult
 from hwp_bench.base.errors import place as checked_place
 from hwp_bench.base.files import inside, read_json, sha256_json, write_json
 from hwp_bench.base.records import parse_record, without_schema
-from hwp_bench.results.bounds import MAX_BYTES
-from hwp_bench.results.schema import Results
+from hwp_bench.results.schema import MAX_BYTES, Results
 
 #: Version of the result file.
 SCHEMA = "hwp-results/1"
@@ -31,11 +30,7 @@ def write_results(path: str | os.PathLike[str], results: Results) -> Path:
 
 
 def content_digest(value: Mapping[str, Any]) -> tuple[str | None, str]:
-    """Return the digest that a result file states, and that of its content.
-
-    Args:
-        value: the file as JSON. Files that are older than this digest state None.
-    """
+    """Return the digest that a result file states, and that of its content."""
     content = {name: item for name, item in value.items() if name not in ("schema", "digest")}
     return value.get("digest"), sha256_json(content)
 

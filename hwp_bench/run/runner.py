@@ -1,4 +1,8 @@
-"""Run a method on one capture in a process of its own, away from the test frames."""
+"""Whether the disc of a run's output had room for images while a method ran.
+
+Many programs do not notice a full disc: OpenCV's `imwrite` leaves an empty file and returns, and
+the program ends well. Such a loss is the disc's fault and not the method's.
+"""
 
 from __future__ import annotations
 
@@ -14,22 +18,12 @@ from pathlib import Path
 
 from hwp_bench.base.console import notice
 from hwp_bench.base.errors import BadInput, BadMethod, MethodFailed, one_line, shown
-from hwp_bench.base.files import inside, read_json, write_json
+from hwp_bench.base.files import inside, read_json, temporary_name, write_json
 from hwp_bench.base.folders import remove_tree, scratch_folder
 from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.manifest import MethodManifest
-from hwp_bench.results.walls import WALLED
-from hwp_bench.run.output import (
-    FAILURE,
-    FREE_VIEW,
-    LOG,
-    PREDICTIONS,
-    PROGRESS,
-    REHEARSAL,
-    RUN,
-    RunFacts,
-    read_facts,
-)
+from hwp_bench.results.schema import ISOLATED
+from hwp_bench.run import START
 from hwp_bench.run.sandbox.confinement import (
     CACHE,
     HOME,
@@ -46,7 +40,62 @@ from hwp_bench.run.sandbox.supervise import (
     remove_odd_files,
     run_confined,
 )
-from hwp_bench.run.space import SpaceWatch
+from hwp_bench.run.worker import (
+    FAILURE,
+    FREE_VIEW,
+    LOG,
+    PREDICTIONS,
+    PROGRESS,
+    REHEARSAL,
+    RUN,
+    RunFacts,
+    read_facts,
+)
+
+#: Free bytes below which a disc counts as full: an image of a megapixel may need this much.
+LOW_SPACE = 4 << 20
+# Bytes that are written to find out whether a quota still allows any.
+_PROBE = 64 << 10
+
+
+class SpaceWatch:
+    """Looks at the free space of a folder's disc again and again, and keeps the least.
+
+    A disc that is full for less time than lies between two looks goes unnoticed.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._least: int | None = None
+
+    def look(self) -> None:
+        """Look once."""
+        with contextlib.suppress(OSError):
+            free = shutil.disk_usage(self._folder).free
+            self._least = free if self._least is None else min(self._least, free)
+
+    def finish(self, log_problem: str | None = None) -> str | None:
+        """Look a last time, and say what the run lacked."""
+        self.look()
+        problem = log_problem or self._refusal()
+        if problem is not None:
+            return f"the disc of its output could not be written while it ran ({problem})"
+        if self._least is not None and self._least < LOW_SPACE:
+            return f"the disc of its output was full while it ran ({self._least:,} bytes left)"
+        return None
+
+    def _refusal(self) -> str | None:
+        """Why nothing can be written now, where free bytes do not tell it: quotas, inodes."""
+        probe = temporary_name(self._folder / "probe")
+        try:
+            probe.write_bytes(bytes(_PROBE))
+        except OSError as error:
+            return error.strerror or type(error).__name__
+        finally:
+            with contextlib.suppress(OSError):
+                probe.unlink(missing_ok=True)
+        return None
+
 
 #: Seconds a method may take on one capture unless told otherwise.
 DEFAULT_TIME_LIMIT = 3600.0
@@ -93,35 +142,16 @@ def run_method(
     confinement: Confinement | None = None,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> RunRecord:
-    """Run a method on a request.
-
-    Args:
-        manifest: the method.
-        capture_id: names the folder of a submission's predictions.
-        request: the request folder.
-        output: the output folder of this run; emptied first.
-        time_limit: seconds after which the process and its children are killed.
-        confinement: how it is confined, and its memory limit; None takes the defaults.
-        on_progress: called with (done, total) steps now and then.
-
-    Returns:
-        Where the predictions lie, and the facts of the run.
-
-    Raises:
-        MethodFailed: it crashed, or ran out of time or memory; the message names the log. Or
-            isolation is required and the system does not allow it.
-        BadMethod: a submission has no predictions for this capture.
-        BadInput: the folder of a submission's predictions leads out of the submission.
-    """
+    """Run a method on a request."""
     if manifest.kind == "predictions":
-        folder = inside(manifest.root, f"{manifest.entry}/{capture_id}")
+        folder = inside(manifest.root, f"{manifest.entry.predictions}/{capture_id}")
         if not folder.is_dir():
             raise BadMethod(
                 f"has no predictions for {capture_id}",
                 where=folder,
-                remedy=f"Put the frames into {manifest.entry}/{capture_id}/.",
+                remedy=f"Put the frames into {manifest.entry.predictions}/{capture_id}/.",
             )
-        clip = inside(manifest.root, f"{manifest.entry}/{capture_id}/{FREE_VIEW}")
+        clip = inside(manifest.root, f"{manifest.entry.predictions}/{capture_id}/{FREE_VIEW}")
         return RunRecord(folder, RunFacts(), 0.0, free_view=clip if clip.is_dir() else None)
     confinement = confinement or Confinement()
     remove_tree(output)
@@ -188,17 +218,6 @@ def rehearse_method(
 
     What fails here would fail on every capture: an import, a setting's value, a device. Of a
     command it is looked whether its program is there.
-
-    Args:
-        manifest: the method.
-        settings: the preset with its overrides, and the seed.
-        time_limit: seconds after which it is stopped.
-        confinement: how it is confined; None takes the defaults.
-
-    Raises:
-        MethodFailed: it cannot be made; the message has the reason, and the last lines that it
-            printed go to standard error.
-        BadMethod: there is no such program.
     """
     if manifest.kind == "command":
         _look_for_program(manifest)
@@ -225,12 +244,8 @@ def rehearse_method(
 
 
 def _look_for_program(manifest: MethodManifest) -> None:
-    """Refuse a command whose program is not there, or may not be run.
-
-    Raises:
-        BadMethod: it is so.
-    """
-    word = str(manifest.entry[0])
+    """Refuse a command whose program is not there, or may not be run."""
+    word = (manifest.entry.command or [""])[0]
     program = word.replace("{method}", str(manifest.root.resolve()))
     if "{" in program or (os.sep in program and not os.path.isabs(program)):
         return
@@ -285,7 +300,7 @@ def _run(
         walled = Program(command, output, environment, places, output / LOG, memory_files)
         outcome = run_confined(walled, limits, poll)
         if outcome.refused is None:
-            return outcome, WALLED
+            return outcome, ISOLATED
         if confinement.mode == "required":
             raise MethodFailed(
                 f"namespaces are required, but the system refuses them ({outcome.refused})",
@@ -306,8 +321,8 @@ def _run(
 
 def _command(manifest: MethodManifest, request: Path, output: Path) -> list[str]:
     if manifest.kind == "python":
-        worker = [sys.executable, "-m", "hwp_bench.run.start", "hwp_bench.run.worker"]
-        method = ["--method", str(manifest.root.resolve()), "--entry", str(manifest.entry)]
+        worker = [sys.executable, *START, "hwp_bench.run.worker"]
+        method = ["--method", str(manifest.root.resolve()), "--entry", str(manifest.entry.python)]
         return [*worker, str(request.resolve()), str(output.resolve()), *method]
     places = {
         "{request}": str(request.resolve()),
@@ -316,7 +331,7 @@ def _command(manifest: MethodManifest, request: Path, output: Path) -> list[str]
         "{python}": sys.executable,
     }
     words = []
-    for word in manifest.entry:
+    for word in manifest.entry.command or ():
         for place, value in places.items():
             word = word.replace(place, value)
         words.append(word)

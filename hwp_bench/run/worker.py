@@ -1,6 +1,6 @@
-"""The process that a Python method runs in, started by `hwp_bench.run.start`.
+"""The output folder of a run: the names in it, and the facts that `run.json` holds.
 
-It is given a request folder and an output folder, and does not know where the capture is.
+The worker writes it for a Python method; a command may write the same files.
 """
 
 from __future__ import annotations
@@ -13,32 +13,100 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 
 from hwp_bench.base.arrays import evenly
 from hwp_bench.base.console import notice
 from hwp_bench.base.errors import BadMethod, HwpError, MethodFailed, shown
 from hwp_bench.base.files import read_json, write_json
 from hwp_bench.base.images import write_image
+from hwp_bench.base.records import Count, Line, Seconds, parse_record
 from hwp_bench.capture.schema import frame_name
 from hwp_bench.hands.skeleton import Camera, HandPose
 from hwp_bench.methods.contract import Avatar, Budget, MethodFactory, TrainingCapture
 from hwp_bench.methods.request import open_request
-from hwp_bench.run.output import (
-    DIAGNOSTICS,
-    FAILURE,
-    FREE_VIEW,
-    PREDICTIONS,
-    PROGRESS,
-    REHEARSAL,
-    RUN,
-    Checkpoint,
-    RunFacts,
-    checkpoint_folder,
-)
+
+#: Folder of the predicted test frames inside the output folder.
+PREDICTIONS = "predictions"
+#: Folder of the predicted frames of the free-view clip inside the output folder.
+FREE_VIEW = "free"
+#: Folder of the validation frames of each checkpoint inside the output folder.
+CHECKPOINTS = "checkpoints"
+#: Folder of files that a method writes about itself, for pictures and tables; optional.
+DIAGNOSTICS = "diagnostics"
+#: Time, steps and memory of the run.
+RUN = "run.json"
+#: How far the fit is.
+PROGRESS = "progress.json"
+#: Why the run failed.
+FAILURE = "failure.json"
+#: The method's printed output.
+LOG = "log.txt"
+#: Settings and seed of a method that is only made, in the place of a request.
+REHEARSAL = "rehearsal.json"
+#: Largest `run.json` that is read, bytes; most frames and checkpoints in it.
+MAX_BYTES = 1024 * 1024
+MAX_FRAMES, MAX_CHECKPOINTS = 64, 1000
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """One recorded moment of a fit."""
+
+    #: Optimizer steps done.
+    step: Count
+    #: Seconds on the method's clock.
+    seconds: Seconds
+    #: Peak memory of the process until then, bytes.
+    peak_memory: Count
+
+
+@dataclass(frozen=True)
+class RunFacts:
+    """Time, steps and memory of a run; None where the method does not say."""
+
+    #: Seconds on the method's clock.
+    fit_seconds: Seconds | None = None
+    #: CPU seconds of the process and its children on that clock, all threads added up.
+    cpu_seconds: Seconds | None = None
+    #: Seconds before that clock started, in which the method was made: what it compiles or loads.
+    ready_seconds: Seconds | None = None
+    #: Seconds to render the test frames.
+    render_seconds: Seconds | None = None
+    #: Seconds spent on checkpoints, outside the method's clock.
+    curve_seconds: Seconds | None = None
+    #: Optimizer steps.
+    steps: Count | None = None
+    #: Peak memory of the process, bytes.
+    peak_memory: Count | None = None
+    #: Device that the method ran on.
+    device: Line | None = None
+    #: Validation frames that were rendered for every checkpoint.
+    checkpoint_frames: Annotated[list[Count], Meta(max_length=MAX_FRAMES)] = field(
+        default_factory=list
+    )
+    #: The checkpoints, in time order; the last is the finished fit.
+    checkpoints: Annotated[list[Checkpoint], Meta(max_length=MAX_CHECKPOINTS)] = field(
+        default_factory=list
+    )
+
+
+def checkpoint_folder(output: Path, index: int) -> Path:
+    """Return the folder of the validation frames of a checkpoint."""
+    return output / CHECKPOINTS / f"{index:03d}"
+
+
+def read_facts(path: Path) -> RunFacts:
+    """Read `run.json`; a run need not write one."""
+    if not path.is_file():
+        return RunFacts()
+    return parse_record(RunFacts, read_json(path, max_bytes=MAX_BYTES), where=str(path))
+
 
 #: Most validation frames that are rendered for a checkpoint.
 CHECKPOINT_FRAMES = 8
@@ -88,11 +156,7 @@ def _leave_reason(output: Path, problem: str) -> None:
 
 
 def load_entry(method: Path, entry: str) -> MethodFactory:
-    """Import `module:callable`; modules in the method directory come first.
-
-    Raises:
-        BadMethod: there is no such module or callable.
-    """
+    """Import `module:callable`; modules in the method directory come first."""
     module_name, _, name = entry.partition(":")
     sys.path.insert(0, str(method.resolve()))
     try:
@@ -108,11 +172,7 @@ def load_entry(method: Path, entry: str) -> MethodFactory:
 
 
 def run(training: TrainingCapture, factory: MethodFactory, output: Path) -> None:
-    """Fit, render the targets, and write predictions, checkpoints and `run.json`.
-
-    Raises:
-        MethodFailed: the method returned something that is not an image.
-    """
+    """Fit, render the targets, and write predictions, checkpoints and `run.json`."""
     frames = checkpoint_frames(training.validation)
 
     def record(index: int, avatar: Avatar) -> None:
@@ -162,7 +222,9 @@ def render_free_views(avatar: Avatar, training: TrainingCapture, folder: Path) -
         assert views is not None
         camera = views.cameras.camera(frame, training.width, training.height)
         try:
-            pixels = drawn(avatar, views.hand_poses(frame), camera, f"free-view frame {frame}")
+            pixels = render_checked(
+                avatar, views.hand_poses(frame), camera, f"free-view frame {frame}"
+            )
         except Exception:
             traceback.print_exc()
             continue
@@ -177,17 +239,15 @@ def checkpoint_frames(validation: np.ndarray) -> list[int]:
 def render(avatar: Avatar, training: TrainingCapture, frame: int) -> np.ndarray:
     """Render one frame of the capture; see `drawn`."""
     hands, camera = training.hand_poses(frame), training.camera(frame)
-    return drawn(avatar, hands, camera, f"frame {frame}")
+    return render_checked(avatar, hands, camera, f"frame {frame}")
 
 
-def drawn(avatar: Avatar, hands: Mapping[str, HandPose], camera: Camera, name: str) -> np.ndarray:
+def render_checked(
+    avatar: Avatar, hands: Mapping[str, HandPose], camera: Camera, name: str
+) -> np.ndarray:
     """Render hands and bring the image to 8 bits: clipped, rounded half to even.
 
     A fourth channel is dropped: the data set owns the mask.
-
-    Raises:
-        MethodFailed: the result has another shape, holds other than real numbers, or is not
-            finite; it says the `name`.
     """
     image = np.asarray(avatar.render(hands, camera))
     size = (camera.height, camera.width)
@@ -209,7 +269,7 @@ def device_name(avatar: Avatar) -> str:
     return str(getattr(avatar, "device", "cpu"))[:100]
 
 
-def schedule(budget: Budget) -> list[float]:
+def checkpoint_times(budget: Budget) -> list[float]:
     """Return the seconds at which checkpoints are due: dense at the start, then regular.
 
     1, 2, 4, 8, ... s, and every tenth of a budget in seconds. (`ReportClock` adds the first offer
@@ -223,19 +283,12 @@ def schedule(budget: Budget) -> list[float]:
 
 
 class ReportClock:
-    """The `Report` that a method is given.
-
-    Args:
-        budget: the budget of the fit.
-        record: called with (index, avatar) when a checkpoint is taken; its time is not
-            counted.
-        progress_file: where the runner looks how far the fit is.
-    """
+    """The `Report` that a method is given."""
 
     def __init__(
         self, budget: Budget, record: Callable[[int, Avatar], None], progress_file: Path
     ) -> None:
-        self._due = schedule(budget)
+        self._due = checkpoint_times(budget)
         self._due_steps = [budget.steps * tenth / 10 for tenth in range(1, 10) if budget.steps]
         self._record = record
         self._progress_file = progress_file
@@ -269,13 +322,7 @@ class ReportClock:
             self.take(step, avatar)
 
     def take(self, step: int, avatar: Avatar, seconds: float | None = None) -> None:
-        """Take a checkpoint now; the clock stands still meanwhile.
-
-        Args:
-            step: of the avatar.
-            avatar: what is rendered.
-            seconds: what the clock said when the avatar was made; what it says now if None.
-        """
+        """Take a checkpoint now; the clock stands still meanwhile."""
         seconds = self.elapsed if seconds is None else seconds
         entered, entered_cpu = time.perf_counter(), cpu_seconds()
         self._due = [moment for moment in self._due if moment > seconds]

@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from hwp_bench.leaderboard.entries import read_entries
-from hwp_bench.leaderboard.records import Submission
+from hwp_bench.leaderboard.entries import Submission, read_entries
 from hwp_bench.leaderboard.rules import current, history
 
 HERE = Path(__file__).parent / "leaderboard"

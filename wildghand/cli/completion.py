@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from hwp_bench.cli.completion import add_shell_argument
+from hwp_bench.cli.program import add_shell_argument
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -14,7 +14,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
-    from hwp_bench.cli.whole_parser import completion_script
+    from hwp_bench.cli.program import completion_script
     from wildghand.cli.main import command_tree
 
     print(completion_script("wildghand", command_tree(), args.shell))

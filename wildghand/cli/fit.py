@@ -192,7 +192,7 @@ def _capture(args: argparse.Namespace, world: World) -> int:
 
 def _settings(args: argparse.Namespace) -> dict[str, Any]:
     """The overrides; a prior's path is the caller's, not the method's."""
-    from hwp_bench.cli.overrides import overrides
+    from hwp_bench.cli.options import overrides
 
     settings = overrides(args.set)
     if args.prior is not None:

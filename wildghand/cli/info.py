@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
         _print_network(args.network, args.json)
         return 0
     from hwp_bench.base.tables import Column, Table, print_table
-    from hwp_bench.results.environment import environment
+    from hwp_bench.results.schema import environment
 
     facts = environment()
     backends = [_check(name) for name in ("numba", "gsplat")]

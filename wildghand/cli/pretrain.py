@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the command."""
     from hwp_bench.base.errors import UsageError
     from hwp_bench.base.files import check_places
-    from hwp_bench.cli.overrides import overrides
+    from hwp_bench.cli.options import overrides
     from wildghand.pretrain.session import pretrain
     from wildghand.prior.files import WEIGHTS
 

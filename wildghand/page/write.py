@@ -16,7 +16,7 @@ import numpy as np
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import atomic_write
 from hwp_bench.capture import Capture
-from hwp_bench.report.page.render import render_template
+from hwp_bench.report.page import render_template
 from wildghand.avatar import WildGHandAvatar, load_avatar
 from wildghand.avatar.avatar import InlinePicture
 from wildghand.avatar.studio import REST

@@ -1,38 +1,186 @@
-"""Run every variant of a method on every capture with every seed."""
+"""The design of an ablation (its variants, and the effects that they make known), and its runs."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations, product
 from pathlib import Path
+from typing import Any
 
-from hwp_bench.analysis.statistics.pairing import MethodRuns
-from hwp_bench.base.folders import exclusive
+from hwp_bench.analysis.pairing import MethodRuns
+from hwp_bench.base.errors import UsageError, did_you_mean
 from hwp_bench.capture.splits import Split
-from hwp_bench.evaluation.ablate.design import Design, Variant
-from hwp_bench.evaluation.capture_evaluation import evaluation_job
 from hwp_bench.evaluation.evaluate import (
     EvaluationSettings,
-    Plan,
-    hiding,
+    OnCapture,
     make_plan,
     open_captures,
+    run_plans,
     with_setting_files,
 )
-from hwp_bench.evaluation.results_folder import (
-    RESULTS,
-    finish_together,
-    open_results_folder,
-    say_kept,
-)
-from hwp_bench.methods.manifest import MethodManifest
+from hwp_bench.methods.manifest import MANIFEST, MethodManifest, Switch
 from hwp_bench.metrics.lpips import load_available
-from hwp_bench.results import CaptureResult, Results, write_results
-from hwp_bench.run.engine import Engine, LocalEngine, Needs
+from hwp_bench.results import Results
+from hwp_bench.run.engine import Engine, Needs
 
-#: Called when a job begins, with (index, count, text); returns what is to be called with
-#: (done, total) steps meanwhile.
-OnJob = Callable[[int, int, str], Callable[[int, int], None] | None]
+#: Components that are crossed when nothing is asked for and the method names none.
+DEFAULT_FACTORS = 2
+#: Most components that are crossed: 2^4 variants.
+MAX_FACTORS = 4
+#: Name of the variant with no switch thrown.
+FULL = "full"
+
+
+@dataclass(frozen=True)
+class Variant:
+    """The method with some switches thrown."""
+
+    #: `full`, `no-dpd`, `no-dpd+no-pao`, `binary-mask`.
+    name: str
+    #: Its name in tables, without the method's name; empty for the full method.
+    title: str
+    #: Names of the switches that are thrown.
+    thrown: tuple[str, ...]
+    #: Settings that override the preset.
+    settings: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class AblationEffect:
+    """A difference between variants that answers one question."""
+
+    #: In tables: `DPD`, `DPD x PAO`.
+    title: str
+    #: `main` (mean over the other components in and out), `interaction`, `out` (of the full
+    #: method), or `alternative` (the full method less the one with the alternative).
+    kind: str
+    #: Coefficient of each variant by name. All add up to 0; the positive ones to 1, or in an
+    #: interaction to 2.
+    contrast: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Design:
+    """The variants that an ablation runs and the effects that it measures."""
+
+    #: Components that are taken out.
+    components: tuple[Switch, ...]
+    #: Alternatives that are put in.
+    alternatives: tuple[Switch, ...]
+    #: Variants, the barest first, the full method last before the alternatives.
+    variants: tuple[Variant, ...]
+    #: Effects.
+    effects: tuple[AblationEffect, ...]
+
+
+def make_design(
+    manifest: MethodManifest, thrown: Sequence[str] = (), crossed: Sequence[str] = ()
+) -> Design:
+    """Choose the variants.
+
+    Without names those components are crossed that the method names for it, or else the first two
+    that it declares: 2^k variants.
+    `crossed` crosses the named components instead: 2^k variants. `thrown` asks what each named
+    switch does to the full method: the full method, the method with only one of them thrown,
+    and, of two components or more, with all of them out. (With two that is the 2 x 2 again.)
+    """
+    if thrown and crossed:
+        raise UsageError(
+            "components are either crossed or taken out one by one", remedy="Leave one out."
+        )
+    switches = [_switch(manifest, name) for name in dict.fromkeys([*thrown, *crossed])]
+    if not switches:
+        declared = [item for item in manifest.switches.values() if not item.alternative]
+        named = [manifest.switches[name] for name in manifest.crossed]
+        switches = named or declared[:DEFAULT_FACTORS]
+        crossed = [item.name for item in switches]
+        if not switches:
+            raise UsageError(
+                "declares no component that could be taken out",
+                where=manifest.root / MANIFEST,
+                field="switches",
+                remedy="docs/methods.md shows how a method declares its switches.",
+            )
+    components = tuple(item for item in switches if not item.alternative)
+    alternatives = tuple(item for item in switches if item.alternative)
+    if crossed and (alternatives or len(components) > MAX_FACTORS):
+        raise UsageError(f"at most {MAX_FACTORS} components, no alternatives, can be crossed")
+    factorial = bool(crossed) or len(components) <= DEFAULT_FACTORS
+    outs = _all_subsets(components) if factorial else _one_by_one(components)
+    variants = [_variant(out) for out in sorted(outs, key=len, reverse=True)]
+    effects = _factorial_effects(components) if factorial else _out_effects(components)
+    if factorial and len(components) > DEFAULT_FACTORS:
+        # With two they follow from the main effects and the interaction at a glance.
+        effects += _out_effects(components)
+    for alternative in alternatives:
+        variants.append(_variant((alternative,)))
+        contrast = {FULL: 1.0, alternative.variant_name: -1.0}
+        effects.append(AblationEffect(f"not {alternative.title}", "alternative", contrast))
+    return Design(components, alternatives, tuple(variants), tuple(effects))
+
+
+def _switch(manifest: MethodManifest, name: str) -> Switch:
+    if name in manifest.switches:
+        return manifest.switches[name]
+    known = ", ".join(manifest.switches) or "none"
+    raise UsageError(
+        f"{manifest.name} has no switch {name!r}",
+        where=manifest.root / MANIFEST,
+        field="switches",
+        remedy=did_you_mean(name, manifest.switches) or f"It declares: {known}.",
+    )
+
+
+def _all_subsets(components: Sequence[Switch]) -> list[tuple[Switch, ...]]:
+    counts = range(len(components) + 1)
+    return [subset for count in counts for subset in combinations(components, count)]
+
+
+def _one_by_one(components: Sequence[Switch]) -> list[tuple[Switch, ...]]:
+    return [(), *((item,) for item in components), tuple(components)]
+
+
+def _variant(thrown: tuple[Switch, ...]) -> Variant:
+    out = [item.title for item in thrown if not item.alternative]
+    alternatives = [item.title for item in thrown if item.alternative]
+    titles = ([f"without {', '.join(out)}"] if out else []) + [f"with {t}" for t in alternatives]
+    settings: dict[str, Any] = {}
+    for item in thrown:
+        settings |= item.settings
+    return Variant(name_of(thrown), ", ".join(titles), tuple(i.name for i in thrown), settings)
+
+
+def name_of(thrown: Sequence[Switch]) -> str:
+    """Return the name of the variant with these switches thrown."""
+    return "+".join(item.variant_name for item in thrown) or FULL
+
+
+def _factorial_effects(components: Sequence[Switch]) -> list[AblationEffect]:
+    """Main effects and interactions of two; each a mean over the other components in and out."""
+    effects = []
+    count = len(components)
+    for order in (1, 2):
+        for chosen in combinations(range(count), order):
+            contrast = {}
+            for present in product((True, False), repeat=count):
+                sign = 1
+                for index in chosen:
+                    sign *= 1 if present[index] else -1
+                out = [c for c, there in zip(components, present, strict=True) if not there]
+                contrast[name_of(out)] = sign / 2.0 ** (count - order)
+            title = " x ".join(components[index].title for index in chosen)
+            effects.append(AblationEffect(title, "main" if order == 1 else "interaction", contrast))
+    return effects
+
+
+def _out_effects(components: Sequence[Switch]) -> list[AblationEffect]:
+    effects = [
+        AblationEffect(item.title, "out", {FULL: 1.0, name_of((item,)): -1.0})
+        for item in components
+    ]
+    together = {FULL: 1.0, name_of(components): -1.0}
+    return [*effects, AblationEffect("all of them", "out", together)]
 
 
 @dataclass(frozen=True)
@@ -64,7 +212,7 @@ def run_ablation(
     seeds: Sequence[int],
     *,
     splits: Mapping[str, Split] | None = None,
-    on_job: OnJob | None = None,
+    on_job: OnCapture | None = None,
     engine: Engine | None = None,
     needs: Needs | None = None,
     overwrite: bool = False,
@@ -77,88 +225,44 @@ def run_ablation(
     The jobs go seed by seed and capture by capture, all variants of a capture after each other:
     the variants are then timed under the same load, and whenever the run is stopped, all have
     been given the same captures. Which variant goes first changes from capture to capture.
-
-    Args:
-        manifest: the method.
-        design: the variants.
-        captures: capture folders.
-        out: folder of the ablation.
-        settings: of every evaluation; its seed is not used.
-        seeds: the seeds.
-        splits: splits by capture id; None applies the 80/10/10 rule.
-        on_job: hook for showing progress, where jobs run in turn.
-        engine: where jobs run; one after another in this process if None.
-        needs: what one job takes of a machine.
-        overwrite: results of another ablation in `out` may be replaced.
-        rehearse: make each variant of the method once before the first job, where any of its
-            jobs is to be run; not to be asked for where they run on other machines.
-
-    Raises:
-        UsageError: `out` holds results of another ablation.
-        MethodFailed: a variant cannot be made.
-        BadMethod: there is no such preset.
-        BadCapture, BadInput, BadImage, BadSplit: a capture is wrong.
-        HwpError: another run is writing to `out`, or nobody can.
     """
     settings = with_setting_files(manifest, settings)
     opened = open_captures(captures, splits)
     networks = load_available()
     plans = {
-        (variant.name, seed): make_plan(
-            replace(manifest, title=_title(manifest, variant)),
+        result_folder(variant.name, seed): make_plan(
+            replace(manifest, title=f"{manifest.title} {variant.title}".strip()),
             opened,
             _of_variant(settings, variant, seed),
             networks,
+            f"{variant.name}, seed {seed}",
         )
         for variant in design.variants
         for seed in seeds
     }
     order = [
-        (seed, number, variant)
+        (result_folder(variant.name, seed), number)
         for seed in seeds
         for number in range(len(opened))
         for variant in _rotated(design.variants, number + seed)
     ]
-    with exclusive(out):
-        folders = {
-            key: open_results_folder(
-                out / result_folder(*key), plan.results([]), plan.evaluations, overwrite=overwrite
-            )
-            for key, plan in plans.items()
-        }
-        say_kept(list(folders.values()))
-        # By capture, so that a result file lists captures in one order whichever ended first.
-        finished = {key: dict(folder.kept) for key, folder in folders.items()}
-        missing = [
-            (seed, number, variant)
-            for seed, number, variant in order
-            if number not in folders[variant.name, seed].kept
-        ]
-        if rehearse:
-            for name in dict.fromkeys(variant.name for _, _, variant in missing):
-                plans[name, seeds[0]].rehearse()
-        jobs = []
-        for seed, number, variant in missing:
-            evaluation = hiding(plans[variant.name, seed].evaluations[number], out)
-            folder = folders[variant.name, seed].unfinished(number)
-            text = f"{evaluation.capture.info.id}, {variant.name}, seed {seed}"
-            jobs.append(evaluation_job(evaluation, folder, text, needs or Needs()))
-
-        def on_done(index: int) -> None:
-            seed, number, variant = missing[index]
-            key = variant.name, seed
-            finished[key][number] = folders[key].finish(number)
-            if not folders[key].replaces:
-                write_results(folders[key].root / RESULTS, _results(plans[key], finished[key]))
-
-        (engine or LocalEngine()).run(jobs, on_done, on_job)
-        whole = [(folders[key], _results(plans[key], finished[key])) for key in plans]
-        finish_together(whole, tables=False)
-    return AblationRuns(design, _runs(design, plans, finished, seeds))
-
-
-def _results(plan: Plan, finished: Mapping[int, CaptureResult]) -> Results:
-    return plan.results([result for _, result in sorted(finished.items())])
+    results = run_plans(
+        out,
+        plans,
+        order,
+        on_start=on_job,
+        engine=engine,
+        needs=needs,
+        overwrite=overwrite,
+        rehearse=rehearse,
+        tables=False,
+    )
+    runs = {}
+    for variant in design.variants:
+        by_seed = {seed: results[result_folder(variant.name, seed)] for seed in seeds}
+        title = plans[result_folder(variant.name, seeds[0])].manifest.title
+        runs[variant.name] = MethodRuns(title, by_seed)
+    return AblationRuns(design, runs)
 
 
 def _of_variant(settings: EvaluationSettings, variant: Variant, seed: int) -> EvaluationSettings:
@@ -169,25 +273,3 @@ def _of_variant(settings: EvaluationSettings, variant: Variant, seed: int) -> Ev
 def _rotated(variants: Sequence[Variant], by: int) -> list[Variant]:
     start = by % len(variants)
     return [*variants[start:], *variants[:start]]
-
-
-def _title(manifest: MethodManifest, variant: Variant) -> str:
-    return f"{manifest.title} {variant.title}".strip()
-
-
-def _runs(
-    design: Design,
-    plans: Mapping[tuple[str, int], Plan],
-    finished: Mapping[tuple[str, int], Mapping[int, CaptureResult]],
-    seeds: Sequence[int],
-) -> dict[str, MethodRuns]:
-    return {
-        variant.name: MethodRuns(
-            plans[variant.name, seeds[0]].manifest.title,
-            {
-                seed: _results(plans[variant.name, seed], finished[variant.name, seed])
-                for seed in seeds
-            },
-        )
-        for variant in design.variants
-    }

@@ -1,25 +1,122 @@
-"""The error budget: what each truth and each correction would gain, in dB."""
+"""The evaluations that an error budget is made of: a method with one truth after another."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from hwp_bench.base.drawing import PAPER, error_map, fitted, labelled, sheet
+from hwp_bench.base.errors import UsageError
+from hwp_bench.base.images import as_uint8
 from hwp_bench.base.tables import Column, Table
-from hwp_bench.evaluation.budget.ceiling import NAME as CEILING
-from hwp_bench.evaluation.budget.ceiling import TEXT as CEILING_TEXT
-from hwp_bench.evaluation.budget.ceiling import Ceiling
+from hwp_bench.capture import Capture, open_capture
+from hwp_bench.capture.splits import Split
 from hwp_bench.evaluation.budget.corrections import CORRECTIONS
-from hwp_bench.evaluation.budget.frames import pairs_of
-from hwp_bench.evaluation.budget.pair import Pair, error_of
-from hwp_bench.evaluation.budget.runs import ALL, GIVEN, BudgetRuns
-from hwp_bench.methods.material import TRUTHS
+from hwp_bench.evaluation.budget.surface import NAME as CEILING
+from hwp_bench.evaluation.budget.surface import TEXT as CEILING_TEXT
+from hwp_bench.evaluation.budget.surface import Ceiling, Pair, error_of, pairs_of
+from hwp_bench.evaluation.evaluate import EvaluationSettings, OnCapture, evaluate
+from hwp_bench.methods.contract import FRAME_CHOICES
+from hwp_bench.methods.request import ORACLE_INPUTS, frame_choice, known_oracle_inputs
 from hwp_bench.metrics.pixels import decibels
 from hwp_bench.metrics.protocol import PSNR_CAP
-from hwp_bench.results import CaptureResult
+from hwp_bench.results import CaptureResult, Results
+from hwp_bench.run.engine import Engine, Needs
+from hwp_bench.sim.produce.subject_mesh import add_subject_mesh
+
+#: Name of the evaluation in which nothing is replaced, and of that in which everything is.
+GIVEN, ALL = "as given", "all of them"
+
+
+@dataclass(frozen=True, eq=False)
+class BudgetRuns:
+    """The evaluations of an error budget."""
+
+    #: The captures, in order.
+    captures: tuple[Capture, ...]
+    #: Results by what the truth replaced: `GIVEN`, names in `ORACLE_INPUTS`, `ALL`.
+    results: Mapping[str, Results]
+    #: Their folders by the same names.
+    folders: Mapping[str, Path]
+
+
+def run_budget(
+    method: str,
+    captures: Sequence[Path],
+    out: Path,
+    settings: EvaluationSettings,
+    truths: Sequence[str] = tuple(ORACLE_INPUTS),
+    *,
+    splits: Mapping[str, Split] | None = None,
+    on_run: Callable[[int, int, str], OnCapture | None] | None = None,
+    engine: Engine | None = None,
+    needs: Needs | None = None,
+    overwrite: bool = False,
+    rehearse: bool = False,
+) -> BudgetRuns:
+    """Evaluate a method as it is, with each truth in place of an estimate, and with all of them.
+
+    What is on disk from an earlier start is taken as it is.
+    """
+    check_oracle_inputs(truths, settings)
+    opened = tuple(open_capture(path) for path in captures)
+    if "mesh" in truths:
+        # Captures that were rendered before it was stored get it from their scene.
+        for capture in opened:
+            add_subject_mesh(capture)
+    variants = plan_variants([known_oracle_inputs(capture) for capture in opened], truths)
+    results, folders = {}, {}
+    for index, (name, replaced) in enumerate(variants.items()):
+        folders[name] = out / "runs" / name.replace(" ", "-")
+        results[name] = evaluate(
+            method,
+            captures,
+            folders[name],
+            replace(settings, run=replace(settings.run, frames=frame_choice(replaced))),
+            splits=splits,
+            on_capture=on_run(index, len(variants), name) if on_run else None,
+            engine=engine,
+            needs=needs,
+            overwrite=overwrite,
+            rehearse=rehearse and index == 0,
+        )
+    return BudgetRuns(opened, results, folders)
+
+
+def check_oracle_inputs(truths: Sequence[str], settings: EvaluationSettings) -> None:
+    """Refuse what no error budget is made of."""
+    if settings.run.frames != FRAME_CHOICES[0]:
+        raise UsageError(
+            f"{settings.run.frames!r} is an oracle itself", field="--frames", remedy="Leave it out."
+        )
+    unknown = sorted(set(truths) - set(ORACLE_INPUTS))
+    if unknown:
+        raise UsageError(
+            f"{unknown[0]!r} is not an estimate",
+            field="--truths",
+            remedy=f"Known: {', '.join(ORACLE_INPUTS)}.",
+        )
+
+
+def plan_variants(
+    known: Sequence[Sequence[str]], truths: Sequence[str]
+) -> dict[str, tuple[str, ...]]:
+    """The estimates that the truth replaces in each evaluation, by its name."""
+    common = [
+        name
+        for name in ORACLE_INPUTS
+        if name in truths and all(name in capture for capture in known)
+    ]
+    variants: dict[str, tuple[str, ...]] = {GIVEN: ()}
+    variants |= {name: (name,) for name in common}
+    if len(common) > 1:
+        variants[ALL] = tuple(common)
+    return variants
+
 
 #: Version of the budget file.
 SCHEMA = "hwp-budget/1"
@@ -48,7 +145,7 @@ class BudgetRow:
 
 
 @dataclass(frozen=True)
-class Budget:
+class ErrorBudget:
     """An error budget."""
 
     #: Title of the method.
@@ -65,7 +162,7 @@ class Budget:
         return {"schema": SCHEMA, **asdict(self)}
 
 
-def make_budget(runs: BudgetRuns) -> Budget:
+def make_budget(runs: BudgetRuns) -> ErrorBudget:
     """Compute the budget of finished evaluations.
 
     Frames that the method left out keep the protocol's penalty in every row.
@@ -76,7 +173,9 @@ def make_budget(runs: BudgetRuns) -> Budget:
     for name, result in runs.results.items():
         if name != GIVEN:
             psnr = {capture.id: _psnr(capture) for capture in result.captures}
-            rows.append(_row("truth", name, TRUTHS.get(name, "all truths above"), psnr, base))
+            rows.append(
+                _row("truth", name, ORACLE_INPUTS.get(name, "all truths above"), psnr, base)
+            )
     corrected: dict[str, dict[str, float]] = {name: {} for name in CORRECTIONS}
     shown, ceilings = {}, {}
     for capture, found in zip(runs.captures, given.captures, strict=True):
@@ -86,7 +185,7 @@ def make_budget(runs: BudgetRuns) -> Budget:
         ceiling, most = Ceiling.of(capture), []
         for frame, pair in pairs_of(capture, folder, list(scores)):
             for name, (correct, _) in CORRECTIONS.items():
-                better = 0.0 if pair is None else gained(correct(pair), pair)
+                better = 0.0 if pair is None else measure_gain(correct(pair), pair)
                 gains[name].append(scores[frame] + better)
             if ceiling is not None:
                 most.append(ceiling.psnr(frame, pair, scores[frame]))
@@ -102,15 +201,15 @@ def make_budget(runs: BudgetRuns) -> Budget:
     ]
     if len(ceilings) == len(base):
         rows.append(_row("ceiling", CEILING, CEILING_TEXT, ceilings, base))
-    return Budget(given.method.title, base, tuple(rows), shown)
+    return ErrorBudget(given.method.title, base, tuple(rows), shown)
 
 
-def gained(image: np.ndarray, pair: Pair) -> float:
+def measure_gain(image: np.ndarray, pair: Pair) -> float:
     """Gain of an image (H, W, 3) in place of the prediction, dB; 0 where it is not better."""
     return max(0.0, decibels(error_of(image, pair)) - decibels(pair.error))
 
 
-def next_work(budget: Budget) -> str:
+def next_work(budget: ErrorBudget) -> str:
     """One sentence for people: the truth and the correction that would gain most."""
     parts = []
     for kind, text in (("truth", "before fitting"), ("correction", "in the rendered frames")):
@@ -125,7 +224,7 @@ def next_work(budget: Budget) -> str:
 _SUMS = (ALL, "motion+light", "gain map")
 
 
-def budget_tables(budget: Budget) -> dict[str, Table]:
+def budget_tables(budget: ErrorBudget) -> dict[str, Table]:
     """The tables `budget` (means over captures) and `captures` (gain on each)."""
     count = len(budget.psnr)
     columns = [
@@ -182,3 +281,60 @@ def _row(
 
 def _psnr(capture: CaptureResult) -> float:
     return float(np.mean([min(frame.scores["psnr"], PSNR_CAP) for frame in capture.frames]))
+
+
+# Larger side of a tile, px, and pixels around the hand.
+_EDGE, _MARGIN = 176, 4
+
+
+def budget_sheet(runs: BudgetRuns, budget: ErrorBudget) -> np.ndarray:
+    """Draw two rows for each capture, with PSNR over the tiles.
+
+    The first has the truth, the method as it is, and the method with each truth; the second the
+    error of the method as it is, and its corrections.
+    """
+    columns = 1 + max(len(runs.results), len(CORRECTIONS))
+    tiles: list[np.ndarray] = []
+    for capture in runs.captures:
+        name = capture.info.id
+        frame = budget.shown[name]
+        pairs = {
+            variant: next(pairs_of(capture, folder / "captures" / name / "predictions", [frame]))[1]
+            for variant, folder in runs.folders.items()
+        }
+        for row in _rows(f"{name} {frame}", pairs):
+            tiles += [*row, *[_blank("")] * (columns - len(row))]
+    return sheet(tiles, columns)
+
+
+def _rows(title: str, pairs: Mapping[str, Pair | None]) -> list[list[np.ndarray]]:
+    sound = next((pair for pair in pairs.values() if pair is not None), None)
+    first = [_blank(f"{title} failed") if sound is None else _tile(sound.target, sound, title)]
+    for name, pair in pairs.items():
+        first.append(_blank(f"{name} failed") if pair is None else _scored(name, pair, None))
+    given = pairs[GIVEN]
+    if given is None:
+        return [first, [_blank(f"{GIVEN} failed")]]
+    wrong = error_map(as_uint8(given.prediction), as_uint8(given.target), given.region)
+    second = [_tile(wrong / 255.0, given, f"error {GIVEN}")]
+    second += [_scored(name, given, correct(given)) for name, (correct, _) in CORRECTIONS.items()]
+    return [first, second]
+
+
+def _scored(name: str, pair: Pair, image: np.ndarray | None) -> np.ndarray:
+    shown = pair.prediction if image is None else image
+    return _tile(shown, pair, f"{name} {decibels(error_of(shown, pair)):.1f}")
+
+
+def _tile(image: np.ndarray, pair: Pair, text: str) -> np.ndarray:
+    """The hand's square of an image (H, W, 3) in [0, 1], black around the scored pixels."""
+    shown = as_uint8(np.clip(image, 0.0, 1.0) * pair.region[..., None])
+    rows, columns = np.nonzero(pair.region)
+    half = int(max(np.ptp(rows), np.ptp(columns))) // 2 + _MARGIN
+    top, left = int(rows.min() + rows.max()) // 2, int(columns.min() + columns.max()) // 2
+    padded = np.pad(shown, ((half, half), (half, half), (0, 0)))
+    return labelled(fitted(padded[top : top + 2 * half, left : left + 2 * half], _EDGE), text)
+
+
+def _blank(text: str) -> np.ndarray:
+    return labelled(np.full((_EDGE, _EDGE, 3), PAPER, dtype=np.uint8), text)

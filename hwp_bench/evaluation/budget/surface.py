@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 from scipy.ndimage import distance_transform_edt
+from scipy.spatial.transform import Rotation
 
+from hwp_bench.capture import Capture
+from hwp_bench.capture.schema import TRUE_TEMPLATE, read_subject_mesh
+from hwp_bench.evaluation.scoring import read_prediction
+from hwp_bench.hands.anchors import HandSurfaces
 from hwp_bench.hands.articulation import axis_angle_to_matrix, matrix_to_axis_angle
 from hwp_bench.hands.raster import draw_faces, mix_corners
 from hwp_bench.hands.skeleton import JOINT_COUNT, Camera, HandPose
 from hwp_bench.hands.skinning import pose_hand, project
 from hwp_bench.hands.template import HandTemplate, TemplateTensors
+from hwp_bench.metrics.pixels import decibels, scored_pixels, squared_error
+from hwp_bench.metrics.protocol import HWP_V1
 
 # Numbers of each hand: the turn of every joint, then the translation.
 _TURNS = 3 * JOINT_COUNT
@@ -30,11 +40,6 @@ class MovingSurface:
     A change has K numbers, 51 for each hand in the order of `hands`: a rotation vector for each
     of the 16 joints, rad, which turns the joint after its estimated rotation (in the axes of its
     parent), and the translation, m.
-
-    Args:
-        templates: by side.
-        hands: the estimated hands of the frame, by side, at least one.
-        camera: the camera; the images have its size.
     """
 
     def __init__(
@@ -60,13 +65,6 @@ class MovingSurface:
 
         The changed surface is drawn, so that a finger that moves covers what is behind it. Pixels
         off the changed hands move as the nearest pixel on them: borders move with the hand.
-
-        Args:
-            change: (K,).
-
-        Returns:
-            (H, W, 2) float32 column and row of the source, px; 0 is the centre of the first
-            pixel, as OpenCV's `remap` takes it. Every pixel itself if no hand is in the image.
         """
         self._draw(change)
         height, width = self._camera.height, self._camera.width
@@ -80,15 +78,7 @@ class MovingSurface:
         return (here + ways[self._nearest]).astype(np.float32)
 
     def moves(self, change: np.ndarray, region: np.ndarray) -> np.ndarray:
-        """How far the surface at some pixels goes by a unit of each number, near a change.
-
-        Args:
-            change: (K,).
-            region: (H, W) bool, P pixels.
-
-        Returns:
-            (P, 2, K) px to the right and down by rad and m; zeros if no hand is in the image.
-        """
+        """How far the surface at some pixels goes by a unit of each number, near a change."""
         self._draw(change)
         count = len(self.scales)
         if self._inside is None:
@@ -153,3 +143,130 @@ def _posed(tensors: TemplateTensors, hand: HandPose, changes: np.ndarray) -> tor
     pose = matrix_to_axis_angle(turns @ axis_angle_to_matrix(torch.as_tensor(hand.pose)))
     transl = torch.as_tensor(hand.transl) + given[:, _TURNS:]
     return pose_hand(tensors, pose, torch.as_tensor(hand.betas), transl).vertices
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """A predicted frame and its truth; P pixels are scored."""
+
+    #: (H, W, 3) float in [0, 1], sRGB over black.
+    prediction: np.ndarray
+    #: (H, W, 3) float in [0, 1], sRGB.
+    target: np.ndarray
+    #: (H, W) bool.
+    region: np.ndarray
+    #: (H, W, 3) unit normals of the posed hand in world axes; zeros where the hand is not drawn.
+    normals: np.ndarray
+    #: How the estimated hands' surface moves the pixels; None where no hand is known.
+    surface: MovingSurface | None = None
+
+    @property
+    def error(self) -> float:
+        """Mean squared error over the scored pixels."""
+        return error_of(self.prediction, self)
+
+
+def error_of(image: np.ndarray, pair: Pair) -> float:
+    """Mean squared error of an image (H, W, 3) in place of the prediction."""
+    return float(squared_error(image, pair.target)[pair.region].mean())
+
+
+# Edge of the cells of the surface, m; normals do not depend on it.
+_PATCH = 0.004
+
+
+def pairs_of(
+    capture: Capture, predictions: Path, frames: list[int]
+) -> Iterator[tuple[int, Pair | None]]:
+    """Read the predictions of some test frames next to their truth."""
+    templates = {side: capture.template(side) for side in capture.info.sides}
+    surfaces = HandSurfaces(templates, _PATCH)
+    drawn = surfaces.footprints(
+        capture.true_hands or capture.hands,
+        capture.cameras.Ks,
+        capture.cameras.viewmats,
+        np.array(frames),
+        capture.size,
+    )
+    for frame, footprint in zip(frames, drawn, strict=True):
+        found = read_prediction(predictions, frame, capture.size)
+        if found.pixels is None:
+            yield frame, None
+            continue
+        mask, exact = capture.scoring_mask(frame)
+        normals = np.zeros((*capture.size, 3))
+        normals.reshape(-1, 3)[footprint.pixels] = footprint.normals
+        shown = {
+            side: hand.at(frame, side) for side, hand in capture.hands.items() if hand.valid[frame]
+        }
+        camera = capture.cameras.camera(frame, capture.info.width, capture.info.height)
+        yield (
+            frame,
+            Pair(
+                prediction=found.pixels / 255.0,
+                target=capture.frame(frame) / 255.0,
+                region=scored_pixels(mask, erosion=HWP_V1.mask_erosion, coverage=exact),
+                normals=normals,
+                surface=MovingSurface(templates, shown, camera) if shown else None,
+            ),
+        )
+
+
+#: Name of its row, and what it is.
+NAME = "true colours"
+TEXT = "the true frame moved to the given poses: an avatar without an error of its own"
+
+
+def surfaces_of(capture: Capture) -> dict[str, HandTemplate]:
+    """The subject's own rest hands where the capture holds them, else the hand model."""
+    own = capture.root / TRUE_TEMPLATE
+    models = {side: capture.template(side) for side in capture.info.sides}
+    if not own.is_file():
+        return models
+    return {side: read_subject_mesh(own, model) for side, model in models.items()}
+
+
+def at_given_poses(
+    capture: Capture, frame: int, templates: Mapping[str, HandTemplate]
+) -> np.ndarray | None:
+    """A true frame whose hands are moved from their true poses to the estimated ones.
+
+    Each pixel of the moved surface takes its colour from where its point is in the true frame;
+    pixels next to it follow the nearest one on it.
+    """
+    truth = capture.true_hands
+    if truth is None or not all(hand.valid[frame] for hand in capture.hands.values()):
+        return None
+    true = {side: hand.at(frame, side) for side, hand in truth.items()}
+    given = {side: capture.hands[side].at(frame, side) for side in true}
+    camera = capture.cameras.camera(frame, capture.info.width, capture.info.height)
+    change = []
+    for side, hand in true.items():
+        turn = Rotation.from_rotvec(given[side].pose) * Rotation.from_rotvec(hand.pose).inv()
+        change += [turn.as_rotvec().ravel(), given[side].transl - hand.transl]
+    sources = MovingSurface(templates, true, camera).sources(np.concatenate(change))
+    image = capture.frame(frame).astype(np.float32) / 255.0
+    moved: np.ndarray = cv2.remap(image, sources[..., 0], sources[..., 1], cv2.INTER_LINEAR)
+    return moved
+
+
+@dataclass(frozen=True, eq=False)
+class Ceiling:
+    """The score of an avatar without an error of its own, on a capture that knows the truth."""
+
+    #: The capture.
+    capture: Capture
+    #: Rest hands of its subject, by side.
+    templates: Mapping[str, HandTemplate]
+
+    @classmethod
+    def of(cls, capture: Capture) -> Ceiling | None:
+        """The ceiling of a capture; None where it does not know the true poses."""
+        return None if capture.true_hands is None else cls(capture, surfaces_of(capture))
+
+    def psnr(self, frame: int, pair: Pair | None, score: float) -> float:
+        """PSNR of `at_given_poses`, dB."""
+        if pair is None:
+            return score
+        moved = at_given_poses(self.capture, frame, self.templates)
+        return score if moved is None else decibels(error_of(moved, pair))

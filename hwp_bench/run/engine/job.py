@@ -43,16 +43,7 @@ class Work(Protocol):
     """The work of a job that leaves this process: importable, and small when pickled."""
 
     def __call__(self, inputs: Mapping[str, Path], output: Path, on_progress: OnProgress) -> None:
-        """Do the work.
-
-        Args:
-            inputs: the folders that the job named, where they lie on this machine.
-            output: folder that takes the result; it may hold an earlier attempt's.
-            on_progress: is told (done, total) steps now and then.
-
-        Raises:
-            HwpError: the work cannot be done; a second try would not help.
-        """
+        """Do the work."""
         ...
 
 
@@ -87,17 +78,7 @@ class Engine(Protocol):
     def __exit__(self, *_: object) -> None: ...
 
     def run(self, jobs: Sequence[Job], on_done: OnDone, on_start: OnStart | None = None) -> None:
-        """Run jobs; each result is in its folder before `on_done` hears of it.
-
-        Args:
-            jobs: the jobs, in the order in which they are to begin.
-            on_done: called in this thread, in the order in which the jobs end.
-            on_start: called where `in_turn`; the other engines show the jobs themselves.
-
-        Raises:
-            HwpError: a job failed. In turn, nothing is begun after it; otherwise the other jobs
-                are finished first.
-        """
+        """Run jobs; each result is in its folder before `on_done` hears of it."""
         ...
 
 
@@ -116,11 +97,11 @@ class LocalEngine:
         """Run jobs; see `Engine.run`."""
         for index, job in enumerate(jobs):
             on_progress = on_start(index, len(jobs), job.text) if on_start else None
-            job.here(on_progress or ignore)
+            job.here(on_progress or ignore_progress)
             on_done(index)
 
 
-def ignore(done: int, total: int) -> None:
+def ignore_progress(done: int, total: int) -> None:
     """Be told the steps of a job that nobody watches."""
 
 
@@ -149,7 +130,7 @@ class Failures:
         ) from first
 
 
-def lost(text: str, retries: int, reason: str) -> HwpError:
+def worker_lost_error(text: str, retries: int, reason: str) -> HwpError:
     """Return the error of a job that lost its worker too often."""
     return HwpError(
         f"the worker of the job {text!r} was lost {retries + 1} times ({reason})",

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from hwp_bench.run.engine.job import Engine, Needs
+from hwp_bench.base.errors import UsageError
+from hwp_bench.run.engine.job import Engine, LocalEngine, Needs
 
 
 def add_engine_arguments(parser: argparse.ArgumentParser) -> None:
@@ -42,14 +41,7 @@ def add_engine_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def engine_for(args: argparse.Namespace) -> Engine:
-    """Return the engine that was asked for; nothing is started yet.
-
-    Raises:
-        UsageError: there is no such engine, or a number makes no sense.
-        MissingDependency: Ray is not installed.
-    """
-    from hwp_bench.base.errors import UsageError
-
+    """Return the engine that was asked for; nothing is started yet."""
     kind, separator, address = args.engine.partition("://")
     if kind not in ("local", "ray") or (separator and (kind == "local" or not address)):
         raise UsageError(
@@ -70,25 +62,21 @@ def engine_for(args: argparse.Namespace) -> Engine:
                 field="--jobs",
                 remedy="On a cluster --job-cpus and --job-gpus say how many jobs a node takes.",
             )
-        from hwp_bench.run.engine.ray_connect import import_ray
+        from hwp_bench.run.engine.ray import import_ray
 
         import_ray()
         from hwp_bench.base.console import JobsView
-        from hwp_bench.run.engine.ray_engine import RayEngine
+        from hwp_bench.run.engine.ray import RayEngine
 
         return RayEngine(address or None, JobsView())
     if args.jobs > 1:
         from hwp_bench.base.console import JobsView
-        from hwp_bench.run.engine.parallel import ParallelEngine
+        from hwp_bench.run.engine.processes import ParallelEngine
 
         return ParallelEngine(args.jobs, JobsView())
-    from hwp_bench.run.engine.job import LocalEngine
-
     return LocalEngine()
 
 
 def needs_of(args: argparse.Namespace) -> Needs:
     """Return the share of a machine that one job takes."""
-    from hwp_bench.run.engine.job import Needs
-
     return Needs(args.job_cpus, args.job_gpus)

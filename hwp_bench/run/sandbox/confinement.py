@@ -1,22 +1,132 @@
-"""How far a method's process is confined, and what it finds: environment variables and files."""
+"""The folders of Python that a sandbox shows: the interpreter, its packages, the toolkit.
+
+The list is fixed: another interpreter is shown only where a person names it (`--expose`).
+"""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import site
+import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from glob import glob
+from glob import escape, glob
 from pathlib import Path
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import cache_root
 from hwp_bench.base.numerics import OPENCV_WAITING, OPENMP_WAITING, TORCH_COUNTS
 from hwp_bench.base.packages import PACKAGES, data_folder
-from hwp_bench.run.sandbox.memory import SCRATCH, SCRATCH_BYTES, default_limit, scratch_bytes
-from hwp_bench.run.sandbox.pythons import checkout, of_packages, python_places
-from hwp_bench.run.sandbox.root import Place
-from hwp_bench.run.sandbox.secluded import foreign_folders, secluded_rooms
+from hwp_bench.methods.contents import is_foreign
+from hwp_bench.run.sandbox.launch import Place
+from hwp_bench.run.sandbox.supervise import SCRATCH, SCRATCH_BYTES, default_limit, scratch_bytes
+
+#: Files that a project has at its top, next to what nobody needs who imports it.
+_PROJECT_MARKS = ("pyproject.toml", "setup.py", "setup.cfg", ".git")
+
+
+def python_places() -> list[str]:
+    """Return the folders of this interpreter, its packages and the toolkit."""
+    sites = _sites()
+    linked = [path for folder in _linked(sites) for path in package_paths(folder)]
+    return [sys.prefix, sys.base_prefix, *package_paths(os.fspath(PACKAGES)), *sites, *linked]
+
+
+def _sites() -> list[str]:
+    return [*site.getsitepackages(), site.getusersitepackages()]
+
+
+def package_paths(folder: str) -> list[str]:
+    """Return what is shown of a folder on the path: of a project, its packages and modules.
+
+    Methods need nothing else of it, such as tests, runs, history and files with secrets.
+    """
+    real = os.path.realpath(folder)
+    if not any(os.path.exists(os.path.join(real, mark)) for mark in _PROJECT_MARKS):
+        return [folder]
+    packages = [os.path.dirname(path) for path in glob(f"{escape(real)}/*/__init__.py")]
+    modules = [path for end in ("py", "so") for path in glob(f"{escape(real)}/*.{end}")]
+    return packages if _is_checkout(real) else [*packages, *modules]
+
+
+def toolkit_checkout() -> list[str]:
+    """Return the toolkit's checkout, to be hidden where it lies in a folder that is shown."""
+    root = os.path.realpath(PACKAGES)
+    return [root] if _is_checkout(root) else []
+
+
+def _is_checkout(folder: str) -> bool:
+    files = ("hwp_bench/__init__.py", "pyproject.toml")
+    return all(os.path.isfile(os.path.join(folder, file)) for file in files)
+
+
+def _linked(sites: Iterable[str]) -> list[str]:
+    """Return the folders that `.pth` files add, as editable installs do."""
+    files = [path for folder in sites for path in glob(f"{folder}/*.pth")]
+    lines = [line for path in files for line in Path(path).read_text(errors="replace").splitlines()]
+    return [line.strip() for line in lines if os.path.isabs(line) and os.path.isdir(line.strip())]
+
+
+#: Parts of `hwp_bench` that a method may import: all that methods which ship are built from. Any
+#: other stays out of sight; those render, seal, score or rank test frames.
+VISIBLE_PACKAGES = frozenset(
+    {"_data", "analysis", "base", "capture", "cli", "hands", "importers", "methods", "metrics"}
+    | {"report", "results", "run", "taxonomy", "tracking"}
+)
+
+#: Most folders of a method that are looked into.
+MAX_FOLDERS = 20_000
+
+
+def hidden_packages(folders: Iterable[str]) -> list[str]:
+    """Return the parts of every installed `hwp_bench` that methods do not see."""
+    found = []
+    for folder in folders:
+        above = [
+            folder,
+            os.path.dirname(folder),
+            *glob(f"{escape(folder)}/lib*/python*/*-packages"),
+        ]
+        for place in above:
+            package = os.path.join(place, "hwp_bench")
+            # A name alone would hide somebody else's folder of that name.
+            if os.path.isfile(os.path.join(package, "__init__.py")):
+                found += _parts(package)
+    return list(dict.fromkeys(found))
+
+
+def _parts(package: str) -> list[str]:
+    with os.scandir(package) as entries:
+        return [
+            entry.path
+            for entry in entries
+            # A link would have another place hidden.
+            if entry.is_dir(follow_symlinks=False)
+            and entry.name not in VISIBLE_PACKAGES | {"__pycache__"}
+        ]
+
+
+def foreign_folders(method: Path) -> list[str]:
+    """Return the folders below a method's that do not belong to it: captures and outputs of runs.
+
+    `is_foreign` knows them, as the digest of a method does. Links are not followed; inside walls
+    they lead nowhere.
+    """
+    found = []
+    for seen, (folder, folders, files) in enumerate(os.walk(method)):
+        if seen == MAX_FOLDERS:
+            raise UsageError(
+                f"holds more than {MAX_FOLDERS} folders, too many to tell what is the method's",
+                where=method,
+                remedy="Keep the method in a folder of its own.",
+            )
+        own = folder == os.fspath(method)
+        if not own and is_foreign(folder, files):
+            found.append(folder)
+            folders.clear()
+    return found
+
 
 #: `auto` takes namespaces where the system allows them and says so where it does not; `required`
 #: refuses to run without; `none` leaves the program its user's files and network.
@@ -111,12 +221,7 @@ class Confinement:
 
 
 def plain_environment(method: Path, output: Path) -> dict[str, str]:
-    """Return the environment of a method that runs without a sandbox.
-
-    Args:
-        method: its directory.
-        output: its work folder.
-    """
+    """Return the environment of a method that runs without a sandbox."""
     return {**_taken((*INHERITED, *INHERITED_FOLDERS)), **_cache_environment(method, output)}
 
 
@@ -131,15 +236,6 @@ def sandbox_environment(
     runs that lie below its own folder (`secluded`), unless `exposed` names them.
 
     Nothing that a method brings decides what is shown: not its command, nor links in its folder.
-
-    Args:
-        method: its directory.
-        request: the folder that it is given.
-        output: its work folder.
-        confinement: what else is shown or hidden, and how much memory it may take.
-
-    Raises:
-        UsageError: a path that is to be exposed does not exist.
     """
     for path in confinement.exposed:
         if not path.exists():
@@ -173,11 +269,7 @@ def has_accelerators() -> bool:
 
 
 def hand_model_files(source: str) -> list[Path]:
-    """Return the files of a hand model that a user brought, to be shown to a method.
-
-    Args:
-        source: the model as a capture names it: `anny`, `mano:PATH`, `mano-hd:PATH`.
-    """
+    """Return the files of a hand model that a user brought, to be shown to a method."""
     kind, _, place = source.partition(":")
     path = Path(place)
     if not kind.startswith("mano") or not path.is_absolute():
@@ -212,7 +304,7 @@ def _libraries() -> list[Path]:
     """Folders of `PYTHONPATH`."""
     entries = os.environ.get("PYTHONPATH", "").split(os.pathsep)
     absolute = [entry for entry in entries if os.path.isabs(entry)]
-    return [Path(path) for entry in absolute for path in of_packages(entry)]
+    return [Path(path) for entry in absolute for path in package_paths(entry)]
 
 
 def _torch_home() -> Path:
@@ -257,24 +349,17 @@ def visible_places(
     hidden: Iterable[Path] = (),
     scratch: int = SCRATCH_BYTES,
 ) -> list[Place]:
-    """Return the places that a sandbox shows, outer ones first.
-
-    Args:
-        read: files and folders that it may read, besides the system, Python and the toolkit.
-        write: folders that it may write to.
-        hidden: folders that stay empty even inside a folder that it may read.
-        scratch: size of each scratch folder, bytes.
-    """
+    """Return the places that a sandbox shows, outer ones first."""
     chosen: dict[str, tuple[str, str]] = {
         "/proc": ("proc", ""),
         "/dev/fd": ("link", "/proc/self/fd"),
     }
     chosen |= dict.fromkeys(SCRATCH, ("scratch", str(scratch)))
     shown = [*_system(), *python_places(), *map(os.fspath, read)]
-    rooms = secluded_rooms([*shown, "/usr/local", *glob("/opt/*")])
+    rooms = hidden_packages([*shown, "/usr/local", *glob("/opt/*")])
     groups: Sequence[tuple[str, Iterable[str | Path]]] = (
         ("read", shown),
-        ("hidden", [*checkout(), *rooms, *hidden]),
+        ("hidden", [*toolkit_checkout(), *rooms, *hidden]),
         ("write", write),
     )
     for kind, paths in groups:

@@ -1,4 +1,9 @@
-"""Start an untrusted program in its sandbox, watch its time and memory, and end all of it."""
+"""How much memory a program and its children hold, what they may hold, and who enforces it.
+
+Where this user may make a memory control group, the kernel counts and enforces. Everywhere else
+the memory is measured, from outside and several times a second: what processes hold, and what no
+process need hold, which are files of the scratch folders, memory files and shared mappings.
+"""
 
 from __future__ import annotations
 
@@ -6,22 +11,271 @@ import contextlib
 import io
 import json
 import os
+import secrets
 import signal
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
 from hwp_bench.base.errors import MethodFailed, shown
 from hwp_bench.base.folders import open_up
 from hwp_bench.base.packages import PACKAGES
-from hwp_bench.run.sandbox import memory
-from hwp_bench.run.sandbox.memory import ControlGroup, Measure
-from hwp_bench.run.sandbox.root import Place
+from hwp_bench.run.sandbox.launch import Place
+
+#: Share of the free memory that a program may take unless told otherwise.
+DEFAULT_SHARE = 0.9
+#: Least free memory of a machine, as a share of all and at most in bytes, before a program ends.
+FLOOR_SHARE, FLOOR_BYTES = 0.015, 256 << 20
+#: Largest size of a scratch folder, bytes, and the most of the limit that it may be.
+SCRATCH_BYTES, SCRATCH_SHARE = 1 << 30, 0.25
+#: Folders in memory that a program in a sandbox may write to.
+SCRATCH = ("/tmp", "/var/tmp", "/dev/shm")
+
+_CONTROL = Path("/sys/fs/cgroup")
+_FIRST_TO_END = "1000"
+_PREFIX, _NEW_SECONDS = "hwp-bench-", 600.0
+_MEMORY_FILE, _SHARED_MAPPING = "/memfd:", b"/dev/zero (deleted)"
+
+
+def default_limit() -> int:
+    """Return nine tenths of the memory that is free now, bytes; of a container, of its share."""
+    import psutil
+
+    free = psutil.virtual_memory().available
+    with contextlib.suppress(OSError, ValueError):
+        most, used = (
+            int((_CONTROL / name).read_text()) for name in ("memory.max", "memory.current")
+        )
+        free = min(free, max(0, most - used))
+    return int(DEFAULT_SHARE * free)
+
+
+def scratch_bytes(limit: int) -> int:
+    """Return the size of each scratch folder under a limit, bytes."""
+    return int(min(SCRATCH_BYTES, SCRATCH_SHARE * limit))
+
+
+def machine_is_short() -> bool:
+    """Whether the machine has so little memory left that it may stand still."""
+    import psutil
+
+    memory = psutil.virtual_memory()
+    return bool(memory.available < min(FLOOR_BYTES, FLOOR_SHARE * memory.total))
+
+
+def kernel_kills() -> int:
+    """Return how many processes the kernel has ended for want of memory since the start."""
+    with contextlib.suppress(OSError, ValueError), open("/proc/vmstat") as table:
+        for line in table:
+            name, _, count = line.partition(" ")
+            if name == "oom_kill":
+                return int(count)
+    return 0
+
+
+def offer_to_kernel(processes: Iterable[int]) -> None:
+    """Have the kernel end these processes first, and not others, when memory runs out.
+
+    They may take it back, so that it is said again whenever they are looked at.
+    """
+    for process in processes:
+        with contextlib.suppress(OSError), open(f"/proc/{process}/oom_score_adj", "r+") as stream:
+            if stream.read().strip() != _FIRST_TO_END:
+                stream.seek(0)
+                stream.write(_FIRST_TO_END)
+
+
+@dataclass
+class Measure:
+    """Measures the memory of a program from outside."""
+
+    # Largest size of each shared mapping that is still held, bytes, by device and inode: a program
+    # may give back all of a mapping but a page, and the pages stay.
+    _mappings: dict[bytes, int] = field(default_factory=dict)
+
+    def used(self, processes: Sequence[int], enough: int) -> int:
+        """Return the memory that processes hold together, bytes.
+
+        What they share is counted once. That is slow to find out, so it is done only where the
+        plain sum, which is never smaller, is above `enough`.
+        """
+        unowned = _scratch(processes) + self._shared(processes) + _memory_files(processes)
+        total = unowned + sum(map(_resident, processes))
+        return total if total <= enough else _proportional(processes, unowned)
+
+    def _shared(self, processes: Iterable[int]) -> int:
+        """Bytes of shared memory without a name, mapped or not, once for all processes."""
+        found: dict[bytes, int] = {}
+        for process in processes:
+            for line in _lines(process, "maps", _SHARED_MAPPING):
+                if line.endswith(_SHARED_MAPPING):
+                    span, _, offset, device, inode = line.split()[:5]
+                    first, last = (int(end, 16) for end in span.split(b"-"))
+                    key = device + inode
+                    size = int(offset, 16) + last - first
+                    found[key] = max(size, found.get(key, 0), self._mappings.get(key, 0))
+        self._mappings = found
+        return sum(found.values())
+
+
+def _lines(process: int, name: str, word: bytes = b"") -> list[bytes]:
+    """The lines of a file of a process; none where it cannot be read or does not hold a word."""
+    with contextlib.suppress(OSError), open(f"/proc/{process}/{name}", "rb") as table:
+        text = table.read()
+        return text.splitlines() if word in text else []
+    return []
+
+
+def _table(process: int, name: str) -> dict[bytes, int]:
+    """The lines `Name: 12 kB` of a file of a process, in bytes."""
+    found = {}
+    for line in _lines(process, name):
+        words = line.split()
+        if len(words) == 3 and words[2] == b"kB":
+            found[words[0].rstrip(b":")] = 1024 * int(words[1])
+    return found
+
+
+def _resident(process: int) -> int:
+    table = _table(process, "status")
+    return sum(table.get(name, 0) for name in (b"VmRSS", b"VmSwap", b"VmPTE"))
+
+
+def _proportional(processes: Iterable[int], unowned: int) -> int:
+    """Memory with shares of what several hold; mapped files in memory are among `unowned`."""
+    own, mapped = 0, 0
+    for process in processes:
+        table = _table(process, "smaps_rollup")
+        if table:
+            own += sum(table.get(name, 0) for name in (b"Pss_Anon", b"Pss_File", b"SwapPss"))
+            own += _table(process, "status").get(b"VmPTE", 0)
+            mapped += table.get(b"Pss_Shmem", 0)
+        else:
+            own += _resident(process)
+    return own + max(mapped, unowned)
+
+
+def _scratch(processes: Iterable[int]) -> int:
+    """Bytes in the scratch folders of a sandbox, as its processes see them; 0 outside of one."""
+    for process in processes:
+        root = f"/proc/{process}/root"
+        with contextlib.suppress(OSError):
+            if os.stat(root).st_dev == os.stat("/").st_dev:
+                continue
+            tables = [os.statvfs(root + folder) for folder in SCRATCH]
+            return sum((table.f_blocks - table.f_bfree) * table.f_frsize for table in tables)
+    return 0
+
+
+def _memory_files(processes: Iterable[int]) -> int:
+    """Bytes of files that exist in memory alone (memfd_create), once for all processes."""
+    sizes: dict[tuple[int, int], int] = {}
+    for process in processes:
+        folder = f"/proc/{process}/fd"
+        with contextlib.suppress(OSError):
+            for name in os.listdir(folder):
+                with contextlib.suppress(OSError):
+                    if os.readlink(f"{folder}/{name}").startswith(_MEMORY_FILE):
+                        status = os.stat(f"{folder}/{name}")
+                        sizes[status.st_dev, status.st_ino] = 512 * status.st_blocks
+    return sum(sizes.values())
+
+
+@dataclass(frozen=True)
+class ControlGroup:
+    """A group of processes whose memory the kernel limits; it also counts what no process holds."""
+
+    #: Its folder.
+    folder: Path
+
+    def take(self, process: int) -> None:
+        """Put a process into it, and with it all that it starts."""
+        (self.folder / "cgroup.procs").write_text(str(process))
+
+    def kills(self) -> int:
+        """Return how many of its processes the kernel has ended, because they took too much."""
+        with contextlib.suppress(OSError, ValueError):
+            for line in (self.folder / "memory.events").read_text().splitlines():
+                name, _, count = line.partition(" ")
+                if name == "oom_kill":
+                    return int(count)
+        return 0
+
+    def remove(self) -> None:
+        """Remove it; its processes must have ended."""
+        # The kernel may still be at work on the last one.
+        for _ in range(50):
+            try:
+                self.folder.rmdir()
+            except FileNotFoundError:
+                return
+            except OSError:
+                time.sleep(0.02)
+            else:
+                return
+
+
+def control_group(
+    limit: int, mounted: Path = _CONTROL, own: str | None = None
+) -> ControlGroup | None:
+    """Make a control group for one run; None where this user or system has none.
+
+    Only the second edition of control groups is used (cgroup v2).
+    """
+    if own is None:
+        own = ""
+        with contextlib.suppress(OSError), open("/proc/self/cgroup") as table:
+            own = table.read()
+    for above in _above(mounted, own):
+        _remove_old(above)
+        group = ControlGroup(above / f"{_PREFIX}{secrets.token_hex(6)}")
+        try:
+            group.folder.mkdir()
+            (group.folder / "memory.max").write_text(str(limit))
+        except OSError:
+            group.remove()
+            continue
+        for name, value in (("memory.swap.max", "0"), ("memory.oom.group", "1")):
+            with contextlib.suppress(OSError):
+                (group.folder / name).write_text(value)
+        return group
+    return None
+
+
+def _remove_old(above: Path) -> None:
+    """Remove groups that killed runs have left; one with processes in it stays."""
+    for folder in above.glob(f"{_PREFIX}*"):
+        with contextlib.suppress(OSError):
+            # A new one is empty until its first process comes.
+            if time.time() - folder.stat().st_mtime > _NEW_SECONDS:
+                folder.rmdir()
+
+
+def _above(mounted: Path, own: str) -> Iterable[Path]:
+    """Folders in which a group of its own may be possible, best first.
+
+    A group that holds processes has no limited groups in it, so that a new one stands next to this
+    process's own.
+    """
+    for line in own.splitlines():
+        if line.startswith("0::/"):
+            here = mounted / line[4:]
+            for folder in (here, here.parent):
+                inside = folder.is_relative_to(mounted) and ".." not in folder.parts
+                if inside and _limits_memory(folder):
+                    yield folder
+
+
+def _limits_memory(folder: Path) -> bool:
+    with contextlib.suppress(OSError):
+        return "memory" in (folder / "cgroup.subtree_control").read_text().split()
+    return False
+
 
 #: Bytes of a program's output that are kept, half of its beginning and half of its end; the middle
 #: is counted and thrown away.
@@ -87,16 +341,7 @@ class ProcessOutcome:
 def run_confined(
     program: Program, limits: Limits, on_poll: Callable[[], None] | None = None
 ) -> ProcessOutcome:
-    """Run a program to its end; whatever ends it, no process of it is left.
-
-    Args:
-        program: what to run.
-        limits: when to stop it.
-        on_poll: called some times a second meanwhile.
-
-    Raises:
-        MethodFailed: there is no such command, or it cannot be executed.
-    """
+    """Run a program to its end; whatever ends it, no process of it is left."""
     log_problems: list[str] = []
     # Before the program runs: it may write next to its log, and put a link in the place of one
     # that is not there yet.
@@ -186,7 +431,7 @@ def _order(program: Program) -> bytes:
 
 def _join_group(process: subprocess.Popen[bytes], limits: Limits) -> ControlGroup | None:
     """Put a launcher into a control group, where there can be one; it still waits for its order."""
-    group = memory.control_group(limits.memory)
+    group = control_group(limits.memory)
     if group is None:
         return None
     try:
@@ -198,13 +443,7 @@ def _join_group(process: subprocess.Popen[bytes], limits: Limits) -> ControlGrou
 
 
 class _Watch:
-    """Waits for the end of a program, and looks how long it runs and what it takes.
-
-    Args:
-        process: the launcher.
-        limits: when the program is to be stopped.
-        group: the control group of its processes, if there is one.
-    """
+    """Waits for the end of a program, and looks how long it runs and what it takes."""
 
     def __init__(
         self, process: subprocess.Popen[bytes], limits: Limits, group: ControlGroup | None
@@ -213,7 +452,7 @@ class _Watch:
         self._limits = limits
         self._group = group
         self._measure = Measure()
-        self._kills = memory.kernel_kills()
+        self._kills = kernel_kills()
         #: Whether the kernel ended processes because they took more than the limit.
         self.over = False
 
@@ -227,7 +466,7 @@ class _Watch:
                 return "time"
             if now >= due:
                 family = _processes_of(self._process.pid)
-                memory.offer_to_kernel(family)
+                offer_to_kernel(family)
                 used = self._measure.used(family, self._limits.memory)
                 broken = self._broken(family, used)
                 if broken is not None:
@@ -243,14 +482,14 @@ class _Watch:
             return "processes"
         if used > self._limits.memory or (self._group is not None and self._group.kills()):
             return "memory"
-        return "machine" if memory.machine_is_short() else None
+        return "machine" if machine_is_short() else None
 
     def finish(self) -> bool:
         """Remove the control group when all has ended; returns whether the kernel lacked memory."""
         if self._group is not None:
             self.over = self._group.kills() > 0
             self._group.remove()
-        return memory.kernel_kills() > self._kills
+        return kernel_kills() > self._kills
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
@@ -281,11 +520,6 @@ def _drain(stream: IO[bytes], log: io.FileIO | None, problems: list[str]) -> Non
 
     Where the log cannot be written, on a full disc for instance, the rest is read all the same:
     a program whose output nobody reads stands still as soon as the pipe is full.
-
-    Args:
-        stream: what the program prints.
-        log: the file, which is closed at the end; None where it could not be opened.
-        problems: takes the reason why the log is not whole.
     """
     if log is not None:
         try:

@@ -19,7 +19,7 @@ from hwp_bench.base.arrays import read_npz
 from hwp_bench.base.errors import BadInput, HwpError
 from hwp_bench.base.files import atomic_write
 from hwp_bench.run.engine.job import OnProgress
-from hwp_bench.run.engine.process import THREADS, LocalJob, Stopped, WorkerLost, run_in_process
+from hwp_bench.run.engine.processes import THREADS, LocalJob, Stopped, WorkerLost, run_in_process
 from hwp_bench.sim.render.frame import render_frame
 from hwp_bench.sim.render.layers import write_layers
 from hwp_bench.sim.scene.schema import Scene

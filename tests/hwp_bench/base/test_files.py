@@ -151,7 +151,7 @@ from pathlib import Path
 import numpy as np
 from hwp_bench.base.files import atomic_folder, atomic_write, write_json
 from hwp_bench.base.images import write_image
-from hwp_bench.run.engine.parcel import pack, unpack
+from hwp_bench.run.engine.ray import pack, unpack
 root = Path({str(tmp_path)!r})
 with atomic_folder(root / "made") as made:
     atomic_write(made / "text", "x")

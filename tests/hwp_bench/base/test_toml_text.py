@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.records import MAX_CHARACTERS, MAX_TOML_DEPTH, parse_toml
-from hwp_bench.cli.overrides import overrides
+from hwp_bench.cli.options import overrides
 from hwp_bench.sim.scene.reader import parse_scene, scene_path
 
 LONG = "9" * 5000

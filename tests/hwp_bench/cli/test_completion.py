@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from hwp_bench.cli.completion import SHELLS
 from hwp_bench.cli.main import command_tree, main
+from hwp_bench.cli.program import SHELLS
 from wildghand.cli.main import main as method
 
 _ASK = r"""

@@ -142,8 +142,8 @@ def test_complex_numbers_of_a_hand_model_are_refused(field: str, tmp_path: Path)
 
 
 def test_the_sheet_is_explained_with_the_words_on_it() -> None:
-    from hwp_bench.cli.data_show import _EXAMPLES
+    from hwp_bench.cli.data import _SHOW
     from hwp_bench.taxonomy import PERTURBATIONS, perturbation
 
     for name in PERTURBATIONS:
-        assert f"{perturbation(name).short}: " in _EXAMPLES
+        assert f"{perturbation(name).short}: " in _SHOW

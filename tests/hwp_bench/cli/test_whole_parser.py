@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from hwp_bench.cli.main import command_tree as toolkit
-from hwp_bench.cli.whole_parser import whole_parser
+from hwp_bench.cli.program import whole_parser
 from wildghand.cli.main import command_tree as method
 
 PROGRAMS = {"hwp-bench": toolkit, "wildghand": method}

@@ -15,8 +15,7 @@ from small_captures import CaptureMaker, hand_picture
 
 from hwp_bench.base.images import as_uint8, write_image
 from hwp_bench.cli.main import main
-from hwp_bench.evaluation.colour_check import colour_warnings
-from hwp_bench.evaluation.scoring import Prediction, Target
+from hwp_bench.evaluation.scoring import Prediction, Target, colour_warnings
 
 
 def _targets() -> list[Target]:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hwp_bench.evaluation.cross_check import SAMPLE, reference_scores, sample_frames
+from hwp_bench.evaluation.verify import CROSS_SAMPLE, reference_scores, sample_frames
 from hwp_bench.metrics import HWP_V1
 from hwp_bench.metrics.score import score_frame
 
@@ -38,4 +38,4 @@ def test_a_sample_is_even_and_bounded() -> None:
     assert sample_frames(1) == [0]
     assert sample_frames(3) == [0, 1, 2]
     assert sample_frames(10) == [0, 3, 6, 9]
-    assert len(sample_frames(1000)) == SAMPLE
+    assert len(sample_frames(1000)) == CROSS_SAMPLE

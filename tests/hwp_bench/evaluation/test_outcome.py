@@ -7,7 +7,7 @@ from pathlib import Path
 
 from small_captures import results_example
 
-from hwp_bench.evaluation.outcome import SHOWN, failure_text, outcome_lines
+from hwp_bench.evaluation.sentences import SHOWN, failure_text, outcome_lines
 from hwp_bench.results import FrameResult
 
 

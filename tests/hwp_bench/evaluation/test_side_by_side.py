@@ -13,7 +13,7 @@ from hwp_bench.base.drawing import GAP, LABEL_HEIGHT
 from hwp_bench.base.images import read_rgb, write_image
 from hwp_bench.capture import Capture
 from hwp_bench.capture.schema import frame_name
-from hwp_bench.evaluation.side_by_side import write_side_by_side
+from hwp_bench.evaluation.artifacts import write_side_by_side
 from hwp_bench.report.sources import ResultsSource
 from hwp_bench.results import FrameResult
 

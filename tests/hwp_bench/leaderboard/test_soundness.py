@@ -14,19 +14,17 @@ from hwp_bench.base.errors import BadResult, UsageError
 from hwp_bench.base.files import cache_root, sha256_json
 from hwp_bench.base.records import parse_record
 from hwp_bench.cli.main import main
-from hwp_bench.leaderboard.board_rows import method_rows
+from hwp_bench.leaderboard.board import method_rows, ranks_of
 from hwp_bench.leaderboard.entries import (
+    Submission,
     entry_name,
     make_entry,
     read_entries,
     write_check,
     write_entry,
 )
-from hwp_bench.leaderboard.names import check_names, register
-from hwp_bench.leaderboard.records import Submission
-from hwp_bench.leaderboard.rules import off_the_data
+from hwp_bench.leaderboard.rules import check_names, off_the_data, register
 from hwp_bench.leaderboard.soundness import check_dates, sound_entries
-from hwp_bench.leaderboard.standings import ranks_of
 from hwp_bench.leaderboard.submit import add_entry
 from hwp_bench.leaderboard.suite_data import (
     CaptureData,

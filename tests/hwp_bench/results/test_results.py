@@ -9,7 +9,7 @@ import pytest
 
 from hwp_bench.base.errors import BadInput, BadResult
 from hwp_bench.results import read_results, write_results
-from hwp_bench.results.environment import environment
+from hwp_bench.results.schema import environment
 
 
 def test_results_round_trip(make_results, tmp_path: Path) -> None:

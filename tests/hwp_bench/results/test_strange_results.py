@@ -1,6 +1,6 @@
 """Results, entries and checks as strangers may write them. Oracle: status 0, 1 or 2, one message.
 
-Whatever is read is within the bounds of `hwp_bench/results/bounds.py`, and is written and read
+Whatever is read is within the bounds of `hwp_bench/results/schema.py`, and is written and read
 again as it is.
 """
 
@@ -21,10 +21,9 @@ from hwp_bench.base.errors import BadInput, BadResult
 from hwp_bench.base.files import sha256_json
 from hwp_bench.base.records import parse_record
 from hwp_bench.cli.main import main
-from hwp_bench.leaderboard.entries import entry_name, make_entry, write_entry
-from hwp_bench.leaderboard.records import Check
+from hwp_bench.leaderboard.entries import Check, entry_name, make_entry, write_entry
 from hwp_bench.results import CurvePoint, Results, read_results, write_results
-from hwp_bench.results.bounds import MAX_BYTES
+from hwp_bench.results.schema import MAX_BYTES
 from hwp_bench.results.store import read_unchanged
 
 _MANY = settings(

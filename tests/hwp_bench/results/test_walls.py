@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 from small_captures import results_example
 
-from hwp_bench.analysis.cost.cost_tables import machine_notes
+from hwp_bench.analysis.cost import machine_notes
 from hwp_bench.base.tables import to_markdown
-from hwp_bench.evaluation.outcome import outcome_lines
-from hwp_bench.report.evaluation_tables import all_tables
+from hwp_bench.evaluation.sentences import outcome_lines
+from hwp_bench.report.tables import all_tables
 from hwp_bench.results import Results
-from hwp_bench.results.walls import noted, walls_note, walls_text
+from hwp_bench.results.schema import add_isolation_note, isolation_note, isolation_text
 
 
 def _made(isolation: str | None, name: str = "plain") -> Results:
@@ -33,8 +33,8 @@ def test_the_console_says_the_level_on_every_run(tmp_path: Path) -> None:
         "warning: v, seed 0, no isolation on capture2 (the system refuses them: "
         "new namespaces: No space). "
     )
-    assert walls_text(_made("processes")).startswith("warning: no isolation on capture2. ")
-    assert walls_text(_made(None)) == ""
+    assert isolation_text(_made("processes")).startswith("warning: no isolation on capture2. ")
+    assert isolation_text(_made(None)) == ""
 
 
 @pytest.mark.parametrize("isolation", ["processes", "processes (mount of /usr: refused)"])
@@ -44,10 +44,10 @@ def test_every_table_names_methods_that_ran_without_walls(isolation: str) -> Non
     for table in all_tables([walled, bare]).values():
         assert table.notes.count(note) == 1
         assert note in to_markdown(table)
-        assert noted(table, [bare]) == table
+        assert add_isolation_note(table, [bare]) == table
     assert machine_notes([walled, bare])[-1] == note
     for kind in ("namespaces", None):
-        assert walls_note([_made(kind)]) == ""
+        assert isolation_note([_made(kind)]) == ""
         assert not any(
             "walls" in text for t in all_tables([_made(kind)]).values() for text in t.notes
         )

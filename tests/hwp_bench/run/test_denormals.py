@@ -17,7 +17,7 @@ from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.manifest import read_manifest
 from hwp_bench.methods.request import write_request
-from hwp_bench.run.engine.process import LocalJob, run_in_process
+from hwp_bench.run.engine.processes import LocalJob, run_in_process
 from hwp_bench.run.runner import run_method
 
 TESTS = Path(__file__).parents[2]

@@ -18,7 +18,7 @@ from hwp_bench.methods.manifest import MethodManifest, read_manifest
 from hwp_bench.methods.request import write_request
 from hwp_bench.run.runner import DEFAULT_TIME_LIMIT, run_method
 from hwp_bench.run.sandbox.supervise import MAX_LOG_BYTES
-from hwp_bench.run.worker import ReportClock, cpu_seconds, schedule
+from hwp_bench.run.worker import ReportClock, checkpoint_times, cpu_seconds
 
 PYTHON = """
 import numpy as np
@@ -193,9 +193,9 @@ pathlib.Path(sys.argv[2], "run.json").write_text('{"fit_seconds": "fast"}')
 
 
 def test_the_schedule_is_dense_at_the_start_then_every_tenth() -> None:
-    assert schedule(Budget(seconds=10.0)) == [1, 2, 3, 4, 5, 6, 7, 8, 9]
-    assert schedule(Budget())[:5] == [1, 2, 4, 8, 16]
-    assert schedule(Budget(seconds=0.5)) == pytest.approx([0.05 * k for k in range(1, 10)])
+    assert checkpoint_times(Budget(seconds=10.0)) == [1, 2, 3, 4, 5, 6, 7, 8, 9]
+    assert checkpoint_times(Budget())[:5] == [1, 2, 4, 8, 16]
+    assert checkpoint_times(Budget(seconds=0.5)) == pytest.approx([0.05 * k for k in range(1, 10)])
 
 
 def test_the_clock_stands_still_while_a_checkpoint_is_taken(

@@ -84,7 +84,7 @@ print("called")
 """
 POISON = """
 import hashlib, pickle
-from hwp_bench.base import machine_code
+from hwp_bench.base import kernels
 class Poison:
     def __reduce__(self):
         return print, ("POISONED",)
@@ -92,8 +92,8 @@ def save(self, sig, data):
     content = pickle.dumps(Poison())
     name = self._name(self._key(sig, data.codegen))
     digest = hashlib.sha256(content).digest()
-    print("left", machine_code.write_private(machine_code.code_folder() / name, digest + content))
-machine_code.MachineCode.save_overload = save
+    print("left", kernels.write_private(kernels.code_folder() / name, digest + content))
+kernels.MachineCode.save_overload = save
 """
 
 

@@ -24,7 +24,7 @@ from hwp_bench.capture import Capture
 from hwp_bench.methods.contract import Budget, TrainingCapture
 from hwp_bench.methods.request import open_request
 from hwp_bench.run import worker
-from hwp_bench.run.output import RUN, read_facts
+from hwp_bench.run.worker import RUN, read_facts
 from wildghand.fitting import session
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.method import WildGHandMethod

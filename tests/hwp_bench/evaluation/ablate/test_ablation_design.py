@@ -9,7 +9,7 @@ import pytest
 
 from hwp_bench.base.console import clock, remaining
 from hwp_bench.base.errors import BadMethod, UsageError
-from hwp_bench.evaluation.ablate.design import make_design
+from hwp_bench.evaluation.ablate.runs import make_design
 from hwp_bench.methods.manifest import MethodManifest, read_manifest
 
 MANIFEST = """

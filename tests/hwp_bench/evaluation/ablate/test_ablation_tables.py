@@ -7,12 +7,10 @@ from pathlib import Path
 import pytest
 from made_results import made_results
 
-from hwp_bench.analysis.statistics.pairing import MethodRuns
+from hwp_bench.analysis.pairing import MethodRuns
 from hwp_bench.base.tables import Table, format_table
-from hwp_bench.evaluation.ablate.ablation_tables import ablation_tables
-from hwp_bench.evaluation.ablate.design import make_design
-from hwp_bench.evaluation.ablate.effects import cost_effects, score_effects
-from hwp_bench.evaluation.ablate.runs import AblationRuns
+from hwp_bench.evaluation.ablate.effects import ablation_tables, cost_effects, score_effects
+from hwp_bench.evaluation.ablate.runs import AblationRuns, make_design
 from hwp_bench.methods.manifest import read_manifest
 
 MANIFEST = """

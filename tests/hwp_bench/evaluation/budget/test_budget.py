@@ -16,10 +16,10 @@ from hwp_bench.base.images import read_rgb
 from hwp_bench.capture import Capture, CaptureWriter, open_capture
 from hwp_bench.capture.schema import TRUE_TEMPLATE, write_subject_mesh
 from hwp_bench.cli.main import main
-from hwp_bench.evaluation.budget.runs import run_budget, variants_of
+from hwp_bench.evaluation.budget.budget import plan_variants, run_budget
 from hwp_bench.evaluation.evaluate import EvaluationSettings
 from hwp_bench.methods.contract import RunSettings
-from hwp_bench.methods.material import TRUTHS
+from hwp_bench.methods.request import ORACLE_INPUTS
 
 _MANIFEST = """
 schema = "hwp-method/1"
@@ -100,7 +100,7 @@ def test_each_truth_gains_what_its_error_costs(
     assert main([*command, "--isolation", "none", "--json"]) == 0
     record = json.loads(capsys.readouterr().out)
     rows = {row["name"]: row["gain"]["dark"] for row in record["rows"]}
-    assert set(rows) >= {*TRUTHS, "all of them", "gain", "light", "motion", "pose"}
+    assert set(rows) >= {*ORACLE_INPUTS, "all of them", "gain", "light", "motion", "pose"}
     # Masks, poses and the mesh do not enter the answer; light and shape do, and both at once most.
     for name in ("masks", "poses", "test-poses", "mesh"):
         assert rows[name] == pytest.approx(0.0, abs=1e-9)
@@ -114,7 +114,7 @@ def test_each_truth_gains_what_its_error_costs(
     assert (out / "tables" / "budget.md").is_file()
     picture = read_rgb(out / "budget.png")
     # The truth, the method as it is, six truths and all of them; below the corrections.
-    assert picture.shape[1] > 176 * (len(TRUTHS) + 3)
+    assert picture.shape[1] > 176 * (len(ORACLE_INPUTS) + 3)
     assert picture.shape[0] > 2 * 176
     given = json.loads((out / "runs" / "as-given" / "results.json").read_text())
     assert [capture["made_by"] for capture in given["captures"]] == ["video 2"]
@@ -126,10 +126,10 @@ def test_each_truth_gains_what_its_error_costs(
 
 
 def test_truths_that_a_capture_lacks_are_left_out() -> None:
-    both = variants_of([("betas", "poses"), ("betas",)], tuple(TRUTHS))
+    both = plan_variants([("betas", "poses"), ("betas",)], tuple(ORACLE_INPUTS))
     assert both == {"as given": (), "betas": ("betas",)}
-    assert variants_of([()], tuple(TRUTHS)) == {"as given": ()}
-    chosen = variants_of([tuple(TRUTHS)], ("poses", "betas"))
+    assert plan_variants([()], tuple(ORACLE_INPUTS)) == {"as given": ()}
+    chosen = plan_variants([tuple(ORACLE_INPUTS)], ("poses", "betas"))
     assert list(chosen) == ["as given", "poses", "betas", "all of them"]
     assert chosen["all of them"] == ("poses", "betas")
 

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from hwp_bench.capture import Capture, CaptureWriter, open_capture
-from hwp_bench.evaluation.budget.ceiling import Ceiling, at_given_poses, surfaces_of
-from hwp_bench.evaluation.budget.pair import Pair
+from hwp_bench.evaluation.budget.surface import Ceiling, Pair, at_given_poses, surfaces_of
 from hwp_bench.hands import HandParameters
 from hwp_bench.metrics.protocol import PSNR_CAP
 

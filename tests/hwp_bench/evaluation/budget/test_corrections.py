@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hwp_bench.base.colors import harmonics, linear_to_srgb, srgb_to_linear
-from hwp_bench.evaluation.budget.budget import gained
+from hwp_bench.evaluation.budget.budget import measure_gain
 from hwp_bench.evaluation.budget.corrections import CORRECTIONS
-from hwp_bench.evaluation.budget.pair import Pair
+from hwp_bench.evaluation.budget.surface import Pair
 
 SIZE = 48
 ROWS, COLUMNS = np.mgrid[:SIZE, :SIZE] / SIZE - 0.5
@@ -41,14 +41,14 @@ def pair_of(prediction: np.ndarray) -> Pair:
 def test_a_gain_is_found_exactly() -> None:
     pair = pair_of(lit(picture(), np.array([0.4, -0.3, 0.2])))
     for name in ("gain", "light", "gain map"):
-        assert gained(CORRECTIONS[name][0](pair), pair) > 40.0, name
+        assert measure_gain(CORRECTIONS[name][0](pair), pair) > 40.0, name
 
 
 def test_another_light_is_found_and_one_gain_is_not_enough() -> None:
     weights = np.random.default_rng(1).normal(0.0, 0.15, (9, 3))
     pair = pair_of(lit(picture(), harmonics(sphere()) @ weights))
-    assert gained(CORRECTIONS["light"][0](pair), pair) > 40.0
-    assert gained(CORRECTIONS["gain"][0](pair), pair) < 15.0
+    assert measure_gain(CORRECTIONS["light"][0](pair), pair) > 40.0
+    assert measure_gain(CORRECTIONS["gain"][0](pair), pair) < 15.0
 
 
 def test_an_affine_motion_is_found() -> None:
@@ -56,8 +56,8 @@ def test_an_affine_motion_is_found() -> None:
     moved = cv2.warpAffine(picture(), matrix, (SIZE, SIZE), borderMode=cv2.BORDER_REFLECT)
     pair = pair_of(moved)
     # Resampled twice with linear weights: what is left is the loss of that.
-    assert gained(CORRECTIONS["motion"][0](pair), pair) > 15.0
-    assert gained(CORRECTIONS["gain"][0](pair), pair) < 3.0
+    assert measure_gain(CORRECTIONS["motion"][0](pair), pair) > 15.0
+    assert measure_gain(CORRECTIONS["gain"][0](pair), pair) < 3.0
 
 
 def test_both_together_find_both() -> None:
@@ -65,9 +65,9 @@ def test_both_together_find_both() -> None:
     dim = lit(picture(), harmonics(sphere()) @ weights)
     matrix = np.array([[1.0, 0.0, 1.5], [0.0, 1.0, 0.5]])
     pair = pair_of(cv2.warpAffine(dim, matrix, (SIZE, SIZE), borderMode=cv2.BORDER_REFLECT))
-    both = gained(CORRECTIONS["motion+light"][0](pair), pair)
-    assert both > gained(CORRECTIONS["motion"][0](pair), pair) + 3.0
-    assert both > gained(CORRECTIONS["light"][0](pair), pair) + 3.0
+    both = measure_gain(CORRECTIONS["motion+light"][0](pair), pair)
+    assert both > measure_gain(CORRECTIONS["motion"][0](pair), pair) + 3.0
+    assert both > measure_gain(CORRECTIONS["light"][0](pair), pair) + 3.0
 
 
 @settings(max_examples=25)
@@ -91,4 +91,4 @@ def test_no_prediction_gives_a_nan_or_a_loss(kind: str, seed: int, name: str) ->
     assert np.isfinite(image).all()
     assert image.min() >= 0.0
     assert image.max() <= 1.0 + 1e-6
-    assert gained(image, pair) >= 0.0
+    assert measure_gain(image, pair) >= 0.0

@@ -11,10 +11,9 @@ import pytest
 import torch
 
 from hwp_bench.base.colors import linear_to_srgb, srgb_to_linear
-from hwp_bench.evaluation.budget.budget import gained
-from hwp_bench.evaluation.budget.motion import motion, pose
-from hwp_bench.evaluation.budget.pair import Pair
-from hwp_bench.evaluation.budget.surface import MovingSurface
+from hwp_bench.evaluation.budget.budget import measure_gain
+from hwp_bench.evaluation.budget.corrections import motion, pose
+from hwp_bench.evaluation.budget.surface import MovingSurface, Pair
 from hwp_bench.hands import load_template
 from hwp_bench.hands.raster import draw_faces, mix_corners
 from hwp_bench.hands.skeleton import Camera, HandPose
@@ -91,23 +90,23 @@ def pair_of(
 def test_a_wrong_pose_is_brought_back(seed: int) -> None:
     pair = pair_of({"right": hand()}, {"right": wrong(hand(), seed)})
     # The error falls by a factor of ten; what is left is resampling, at borders most.
-    assert gained(pose(pair), pair) > 10.0
-    assert gained(pose(pair), pair) > gained(motion(pair), pair)
+    assert measure_gain(pose(pair), pair) > 10.0
+    assert measure_gain(pose(pair), pair) > measure_gain(motion(pair), pair)
 
 
 def test_one_bent_finger_is_beyond_an_affine_motion() -> None:
     estimated = hand()
     estimated.pose[4:7, 2] += 0.15
     pair = pair_of({"right": hand()}, {"right": estimated})
-    assert gained(pose(pair), pair) > 10.0
-    assert gained(motion(pair), pair) < 5.0
+    assert measure_gain(pose(pair), pair) > 10.0
+    assert measure_gain(motion(pair), pair) < 5.0
 
 
 def test_each_of_two_hands_is_brought_back() -> None:
     true = {"right": hand(shift=0.06), "left": hand("left", shift=-0.06)}
     pair = pair_of(true, {side: wrong(given, 5) for side, given in true.items()})
     assert len(MovingSurface(TEMPLATES, true, CAMERA).scales) == 2 * 51
-    assert gained(pose(pair), pair) > 8.0
+    assert measure_gain(pose(pair), pair) > 8.0
 
 
 def test_what_is_no_error_of_the_pose_is_not_explained_by_it() -> None:
@@ -120,7 +119,7 @@ def test_what_is_no_error_of_the_pose_is_not_explained_by_it() -> None:
         linear_to_srgb(srgb_to_linear(sharp) * np.exp([0.3, -0.2, 0.25])),
     ):
         pair = pair_of(true, true, image)
-        assert gained(pose(pair), pair) < 0.5
+        assert measure_gain(pose(pair), pair) < 0.5
     exact = pair_of(true, true)
     assert pose(exact) == pytest.approx(exact.prediction, abs=1e-4)
 

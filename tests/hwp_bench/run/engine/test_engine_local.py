@@ -11,7 +11,7 @@ from engine_jobs import Told, Write, write_job
 
 from hwp_bench.base.errors import BadInput, HwpError, UsageError
 from hwp_bench.run.engine import Engine, LocalEngine, Needs
-from hwp_bench.run.engine.parallel import ParallelEngine, shares
+from hwp_bench.run.engine.processes import ParallelEngine, divide_gpus
 
 
 def texts(folder: Path) -> dict[str, str]:
@@ -109,16 +109,18 @@ def test_a_stop_ends_the_jobs_and_leaves_what_was_finished(tmp_path: Path) -> No
     assert set(texts(tmp_path)) == {"quick"}
     left = [child.cmdline() for child in psutil.Process().children(recursive=True)]
     assert not [
-        words for words in left if any("hwp_bench.run.engine.process" in word for word in words)
+        words for words in left if any("hwp_bench.run.engine.processes" in word for word in words)
     ]
 
 
 def test_gpus_are_divided_or_refused() -> None:
     cards = ["4", "5", "6", "7"]
-    visible = [share.get("CUDA_VISIBLE_DEVICES") for share in shares(4, Needs(gpus=0.5), cards)]
+    visible = [
+        share.get("CUDA_VISIBLE_DEVICES") for share in divide_gpus(4, Needs(gpus=0.5), cards)
+    ]
     assert visible == ["4", "4", "5", "5"]
-    visible = [share.get("CUDA_VISIBLE_DEVICES") for share in shares(2, Needs(gpus=2), cards)]
+    visible = [share.get("CUDA_VISIBLE_DEVICES") for share in divide_gpus(2, Needs(gpus=2), cards)]
     assert visible == ["4,5", "6,7"]
-    assert shares(3, Needs(), []) == [{}, {}, {}]
+    assert divide_gpus(3, Needs(), []) == [{}, {}, {}]
     with pytest.raises(UsageError, match="5 jobs of 1 GPUs at once need 5 GPUs, and there are 4"):
-        shares(5, Needs(gpus=1), cards)
+        divide_gpus(5, Needs(gpus=1), cards)

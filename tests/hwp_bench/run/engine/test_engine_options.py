@@ -12,7 +12,7 @@ from small_captures import CaptureMaker
 
 from hwp_bench.base.errors import HwpError
 from hwp_bench.cli.main import main
-from hwp_bench.run.engine import ray_connect
+from hwp_bench.run.engine import ray as ray_connect
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hwp_bench.base.errors import BadInput, HwpError
-from hwp_bench.run.engine.parcel import Parcel, folder_digest, pack, unpack
+from hwp_bench.run.engine.ray import Parcel, folder_digest, pack, unpack
 
 NAMES = st.text("abcxyz", min_size=1, max_size=3)
 TREES = st.dictionaries(

@@ -18,8 +18,7 @@ from own_cache import make_own_cache
 from same_results import contents
 from small_captures import CaptureMaker
 
-from hwp_bench.evaluation.ablate.design import make_design
-from hwp_bench.evaluation.ablate.runs import run_ablation
+from hwp_bench.evaluation.ablate.runs import make_design, run_ablation
 from hwp_bench.evaluation.evaluate import EvaluationSettings
 from hwp_bench.methods.manifest import read_manifest
 from hwp_bench.run.engine import LocalEngine, Needs
@@ -116,7 +115,7 @@ def wait_until_none_is_left() -> None:
 def test_a_node_is_killed_in_the_middle_and_the_results_are_those_without_ray(
     nodes: Nodes, make_capture: CaptureMaker, tmp_path: Path
 ) -> None:
-    from hwp_bench.run.engine.ray_engine import RayEngine
+    from hwp_bench.run.engine.ray import RayEngine
 
     names = ("one", "two")
     captures = [make_capture(name, frames=20, size=32, perturbations={}).root for name in names]
@@ -156,7 +155,7 @@ def test_a_node_is_killed_in_the_middle_and_the_results_are_those_without_ray(
 
 def test_a_capture_is_rendered_to_the_same_digest(nodes: Nodes, tmp_path: Path) -> None:
     from hwp_bench.capture import open_capture
-    from hwp_bench.run.engine.ray_engine import RayEngine
+    from hwp_bench.run.engine.ray import RayEngine
     from hwp_bench.sim.produce.suites import RenderCapture, render_job
     from hwp_bench.sim.scene.reader import load_scene
 

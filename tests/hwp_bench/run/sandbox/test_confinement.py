@@ -12,10 +12,10 @@ from hwp_bench.base.kernels import KEPT
 from hwp_bench.base.packages import data_folder
 from hwp_bench.run.sandbox.confinement import (
     Confinement,
+    package_paths,
     sandbox_environment,
     visible_places,
 )
-from hwp_bench.run.sandbox.pythons import of_packages
 
 
 def test_outer_places_come_first_and_the_deeper_rule_wins(tmp_path: Path) -> None:
@@ -73,9 +73,9 @@ def test_of_a_project_on_the_path_only_what_is_imported_is_shown(tmp_path: Path)
     (tmp_path / "secrets").mkdir()
     for name in ("module.py", ".env", "notes.txt"):
         (tmp_path / name).touch()
-    assert of_packages(str(tmp_path)) == [str(tmp_path)]  # a folder of packages, such as src/
+    assert package_paths(str(tmp_path)) == [str(tmp_path)]  # a folder of packages, such as src/
     (tmp_path / "pyproject.toml").touch()
-    shown = sorted(Path(path).name for path in of_packages(str(tmp_path)))
+    shown = sorted(Path(path).name for path in package_paths(str(tmp_path)))
     assert shown == ["module.py", "package"]
 
 

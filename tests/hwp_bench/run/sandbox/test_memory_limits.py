@@ -13,9 +13,10 @@ from pathlib import Path
 import pytest
 
 from hwp_bench.base.errors import MethodFailed
-from hwp_bench.run.sandbox import memory, supervise
+from hwp_bench.run.sandbox import supervise
+from hwp_bench.run.sandbox import supervise as memory
 from hwp_bench.run.sandbox.confinement import Confinement
-from hwp_bench.run.sandbox.memory import ControlGroup, Measure, control_group, scratch_bytes
+from hwp_bench.run.sandbox.supervise import ControlGroup, Measure, control_group, scratch_bytes
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="process control is Linux's")
 LIMIT = 200_000_000
@@ -196,7 +197,7 @@ def test_a_kill_in_a_control_group_is_the_limit(attack, monkeypatch, tmp_path: P
     (tmp_path / "group").mkdir()
     (tmp_path / "group" / "memory.events").write_text("oom_kill 1\n")
     group = ControlGroup(tmp_path / "group")
-    monkeypatch.setattr(supervise.memory, "control_group", lambda limit: group)
+    monkeypatch.setattr(supervise, "control_group", lambda limit: group)
     with pytest.raises(MethodFailed, match=r"took more than 0\.2 GB of memory"):
         attack("os.kill(os.getpid(), 9)", "none", memory_limit=LIMIT)
     assert (tmp_path / "group" / "cgroup.procs").read_text() != str(os.getpid())

@@ -11,21 +11,21 @@ from walled_script import run_walled
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.packages import PACKAGES, data_folder
-from hwp_bench.run.sandbox import secluded
-from hwp_bench.run.sandbox.confinement import visible_places
-from hwp_bench.run.sandbox.pythons import of_packages
-from hwp_bench.run.sandbox.secluded import (
-    SHOWN_ROOMS,
+from hwp_bench.run.sandbox import confinement as secluded
+from hwp_bench.run.sandbox.confinement import (
+    VISIBLE_PACKAGES,
     foreign_folders,
-    secluded_rooms,
+    hidden_packages,
+    package_paths,
+    visible_places,
 )
 
 
 def test_every_part_of_the_toolkit_is_shown_or_hidden() -> None:
     parts = {path.parent.name for path in (PACKAGES / "hwp_bench").glob("*/__init__.py")}
     # `_data` is there in a wheel only. A new part must be put on one side or the other, here too.
-    assert SHOWN_ROOMS - {"_data"} < parts
-    assert parts - SHOWN_ROOMS == {"evaluation", "leaderboard", "publish", "sealed", "sim"}
+    assert VISIBLE_PACKAGES - {"_data"} < parts
+    assert parts - VISIBLE_PACKAGES == {"evaluation", "leaderboard", "publish", "sealed", "sim"}
 
 
 def test_a_method_finds_no_simulator_and_no_scene(tmp_path: Path) -> None:
@@ -86,7 +86,7 @@ def test_every_copy_of_the_toolkit_is_found(tmp_path: Path) -> None:
             (tmp_path / place / "hwp_bench" / part).mkdir(parents=True)
         (tmp_path / place / "hwp_bench" / "__init__.py").touch()
     (tmp_path / "other" / "hwp_bench" / "sim").mkdir(parents=True)  # no package of that name
-    found = secluded_rooms(str(tmp_path / name) for name in ("library", "env", "other"))
+    found = hidden_packages(str(tmp_path / name) for name in ("library", "env", "other"))
     names = sorted(Path(path).relative_to(tmp_path).as_posix() for path in found)
     inside = "env/lib/python3.11/site-packages/hwp_bench"
     assert names == [
@@ -105,9 +105,9 @@ def test_of_a_checkout_only_packages_are_shown(tmp_path: Path) -> None:
         (tmp_path / name / "__init__.py").touch()
     for name in ("runs", "tests"):
         (tmp_path / name).mkdir()
-    assert of_packages(str(tmp_path)) == [str(tmp_path)]
+    assert package_paths(str(tmp_path)) == [str(tmp_path)]
     (tmp_path / "pyproject.toml").touch()
-    shown = sorted(Path(path).name for path in of_packages(str(tmp_path)))
+    shown = sorted(Path(path).name for path in package_paths(str(tmp_path)))
     assert shown == ["hwp_bench", "wildghand"]
     # A folder that is shown for another reason does not bring the checkout along.
     if (PACKAGES / "pyproject.toml").is_file():

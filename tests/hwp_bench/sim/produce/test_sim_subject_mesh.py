@@ -18,8 +18,7 @@ from hwp_bench.hands import HandTemplate
 from hwp_bench.hands.anchors import HandSurfaces
 from hwp_bench.hands.raster import overlap
 from hwp_bench.methods.contract import RunSettings
-from hwp_bench.methods.material import frames_with, known_truths
-from hwp_bench.methods.request import open_request, write_request
+from hwp_bench.methods.request import frame_choice, known_oracle_inputs, open_request, write_request
 from hwp_bench.sim.produce.production import render_capture
 from hwp_bench.sim.produce.subject_mesh import (
     add_subject_mesh,
@@ -76,10 +75,10 @@ def agreement(capture: Capture, template: HandTemplate) -> tuple[float, float]:
 def test_a_method_with_the_truth_mesh_gets_hands_that_fill_the_masks(
     capture: Capture, tmp_path: Path
 ) -> None:
-    assert "mesh" in known_truths(capture)
+    assert "mesh" in known_oracle_inputs(capture)
     split = contiguous_split("tiny", FRAMES)
     given = {}
-    for choice in ("perturbed", frames_with(["mesh"])):
+    for choice in ("perturbed", frame_choice(["mesh"])):
         root = write_request(tmp_path / "r", capture, split, RunSettings({}, frames=choice))
         given[choice] = open_request(root).template("right")
     model, own = given.values()
@@ -96,7 +95,7 @@ def test_captures_of_before_get_it_from_their_scene(capture: Capture) -> None:
     stored, digest = read_npz(path), capture.digest
     assert add_subject_mesh(capture)
     path.unlink()
-    assert "mesh" not in known_truths(capture)
+    assert "mesh" not in known_oracle_inputs(capture)
     assert add_subject_mesh(capture)
     again = open_capture(capture.root)
     assert again.digest == digest

@@ -1,0 +1,565 @@
+"""Methods compared: paired differences with intervals, ranks, ties, who wins, and their tables."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from hwp_bench.analysis.bootstrap import RESAMPLES, Estimate, bootstrap_mean
+from hwp_bench.analysis.pairing import (
+    MACRO,
+    MethodRuns,
+    common_metrics,
+    common_seeds,
+    group_runs,
+    refuse_unlike,
+    scopes,
+)
+from hwp_bench.base.errors import UsageError
+from hwp_bench.base.tables import Column, Table, format_table
+from hwp_bench.metrics import metric as metric_facts
+from hwp_bench.results import Results
+from hwp_bench.taxonomy import PERTURBATIONS, perturbation
+
+#: Level at which two methods differ significantly.
+ALPHA = 0.05
+
+
+@dataclass(frozen=True)
+class Difference:
+    """One method less another in one scope."""
+
+    #: Label of the first method.
+    first: str
+    #: Label of the second.
+    second: str
+    #: Name of the metric.
+    metric: str
+    #: A scope of `statistics.pairing.scopes`.
+    scope: str
+    #: First less second, in the metric's unit.
+    estimate: Estimate
+    #: Probability that the first is better, in the metric's own direction.
+    better: float | None
+    #: p-value, adjusted over the perturbations for perturbations and over the pairs of methods
+    #: for the macro mean; None where nothing is adjusted.
+    p_adjusted: float | None = None
+
+
+@dataclass(frozen=True)
+class Standing:
+    """Where one method stands among others."""
+
+    #: Its label.
+    label: str
+    #: Mean in the macro scope, over seeds.
+    mean: float
+    #: Standard deviation of that mean over seeds; None with one seed.
+    seed_deviation: float | None
+    #: Number of seeds.
+    seeds: int
+    #: Letters; two methods that share one do not differ significantly.
+    ties: str
+
+
+def compare(
+    runs: Sequence[MethodRuns],
+    metric: str,
+    *,
+    resamples: int = RESAMPLES,
+    seed: int = 0,
+    scope: str | None = None,
+) -> list[Difference]:
+    """Return the difference of every pair of methods in every scope.
+
+    The runs must have passed `statistics.pairing.refuse_unlike`.
+
+    Args:
+        runs: at least two methods.
+        metric: a metric that all have.
+        resamples: of each interval.
+        seed: of the resampling.
+        scope: the only scope that is wanted; None takes all.
+
+    Raises:
+        UsageError: two methods have no seed in common.
+    """
+    differences: list[Difference] = []
+    for first, second in combinations(runs, 2):
+        differences += _holm_perturbations(_pair(first, second, metric, resamples, seed, scope))
+    places = [index for index, item in enumerate(differences) if item.scope == MACRO]
+    _adjust(differences, places)
+    return differences
+
+
+def _pair(
+    first: MethodRuns,
+    second: MethodRuns,
+    metric: str,
+    resamples: int,
+    seed: int,
+    only: str | None,
+) -> list[Difference]:
+    seeds = common_seeds(first, second)
+    found = []
+    for scope, weights in scopes(first.first).items():
+        if only not in (None, scope):
+            continue
+        samples = [
+            first.values(capture, metric, seeds) - second.values(capture, metric, seeds)
+            for capture in weights
+        ]
+        estimate = bootstrap_mean(samples, list(weights.values()), resamples=resamples, seed=seed)
+        better = estimate.above
+        if better is not None and not metric_facts(metric).higher_is_better:
+            better = 1 - better
+        found.append(Difference(first.label, second.label, metric, scope, estimate, better))
+    return found
+
+
+def _holm_perturbations(found: list[Difference]) -> list[Difference]:
+    _adjust(found, [index for index, item in enumerate(found) if item.scope in PERTURBATIONS])
+    return found
+
+
+def _adjust(found: list[Difference], places: list[int]) -> None:
+    """Put Holm's p-values of one family into the list."""
+    tested = [(place, p) for place in places if (p := found[place].estimate.p) is not None]
+    for (place, _), value in zip(tested, holm([p for _, p in tested]), strict=True):
+        found[place] = replace(found[place], p_adjusted=value)
+
+
+def standings(
+    runs: Sequence[MethodRuns], metric: str, differences: Sequence[Difference]
+) -> list[Standing]:
+    """Return the methods, best first, with their tie groups.
+
+    Args:
+        runs: the methods.
+        metric: the metric of `differences`.
+        differences: what `compare` found; pairs with an adjusted p below `ALPHA` in the macro
+            scope differ significantly.
+    """
+    higher = metric_facts(metric).higher_is_better
+    means = {run.label: macro_by_seed(run, metric) for run in runs}
+    order = sorted(runs, key=lambda run: float(means[run.label].mean()) * (-1 if higher else 1))
+    places = {run.label: place for place, run in enumerate(order)}
+    different = {}
+    for item in differences:
+        if item.scope == MACRO and item.metric == metric:
+            low, high = sorted((places[item.first], places[item.second]))
+            different[low, high] = item.p_adjusted is not None and item.p_adjusted < ALPHA
+    return [
+        Standing(
+            run.label,
+            float(means[run.label].mean()),
+            float(means[run.label].std(ddof=1)) if len(run.seeds) > 1 else None,
+            len(run.seeds),
+            ties,
+        )
+        for run, ties in zip(order, tie_groups(len(order), different), strict=True)
+    ]
+
+
+def macro_by_seed(run: MethodRuns, metric: str) -> np.ndarray:
+    """Return the macro mean of each seed, (S,) float."""
+    weights = scopes(run.first)[MACRO]
+    total = sum(weights.values())
+    seeds = sorted(run.seeds)
+    means = [
+        weight * run.values(capture, metric, seeds).mean(axis=1)
+        for capture, weight in weights.items()
+    ]
+    return np.sum(means, axis=0) / total
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Adjust p-values so that the chance of any false finding stays at the level.
+
+    Args:
+        p_values: of the comparisons of one family, in any order.
+
+    Returns:
+        The adjusted values, in the same order, at most 1.
+
+    Source: Holm, A simple sequentially rejective multiple test procedure, 1979.
+    """
+    order = sorted(range(len(p_values)), key=lambda index: p_values[index])
+    adjusted = [1.0] * len(p_values)
+    running = 0.0
+    for rank, index in enumerate(order):
+        running = max(running, min(1.0, (len(p_values) - rank) * p_values[index]))
+        adjusted[index] = running
+    return adjusted
+
+
+def tie_groups(count: int, different: Mapping[tuple[int, int], bool]) -> list[str]:
+    """Return letters such that two items share one exactly where they do not differ.
+
+    Args:
+        count: number of items, best first.
+        different: for each pair (i, j), i < j, whether the two differ.
+
+    Returns:
+        The letters of each item: `a`, `ab`, `b`, ...
+
+    Source: insert and absorb, Piepho, An algorithm for a letter-based representation of all
+    pairwise comparisons, 2004.
+    """
+    groups = [frozenset(range(count))]
+    for first, second in sorted(pair for pair, differs in different.items() if differs):
+        split: list[frozenset[int]] = []
+        for group in groups:
+            both = first in group and second in group
+            split += [group - {first}, group - {second}] if both else [group]
+        groups = [
+            group
+            for place, group in enumerate(split)
+            if not any(
+                group < other or (group == other and place > index)
+                for index, other in enumerate(split)
+            )
+        ]
+    groups.sort(key=sorted)
+    return [
+        "".join(_letter(place) for place, group in enumerate(groups) if item in group)
+        for item in range(count)
+    ]
+
+
+def _letter(place: int) -> str:
+    """Return `a` to `z`, then `a1`, `b1`, ..."""
+    return chr(ord("a") + place % 26) + (str(place // 26) if place >= 26 else "")
+
+
+@dataclass(frozen=True)
+class Rank:
+    """The place of one method among others in one metric."""
+
+    #: Its label, mean and tie group.
+    standing: Standing
+    #: 1 for the best mean; equal means share the smaller number.
+    rank: int
+    #: Best rank that the data allow.
+    best: int
+    #: Worst rank that the data allow.
+    worst: int
+    #: This method less the leader; None for the leader itself.
+    behind: Estimate | None
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """Methods in order, and what is known of their order."""
+
+    #: Name of the metric.
+    metric: str
+    #: The methods, best first.
+    ranks: tuple[Rank, ...]
+    #: The paired differences of the macro mean.
+    differences: tuple[Difference, ...]
+
+
+def rank_methods(
+    runs: Sequence[MethodRuns], metric: str, *, resamples: int = RESAMPLES, seed: int = 0
+) -> Ranking:
+    """Rank methods by their macro mean.
+
+    The interval of a rank goes from one more than the number of methods that are significantly
+    better to the number of all less those that are significantly worse. Each method is tested
+    against every other one, with Bonferroni's adjustment over these pairs: the interval of each
+    method holds with 95 %, and so does the claim that the first is the best, although the data
+    chose it. (A wrong claim needs that some method beats the truly best one in a test at
+    `ALPHA` / (m - 1); there are m - 1 such tests.) The tie groups speak of all pairs at once and
+    claim less.
+
+    Args:
+        runs: the methods, which must have passed `statistics.pairing.refuse_unlike`.
+        metric: a metric that all have.
+        resamples: of each interval.
+        seed: of the resampling.
+
+    Raises:
+        UsageError: two methods have no seed in common.
+
+    Source: Mogstad, Romano, Shaikh and Wilhelm, Inference for ranks with applications to mobility
+    across neighbourhoods and academic achievement across countries, Review of Economic Studies
+    91(1), 2024 (marginal confidence sets: the pairs of one population), in a single step.
+    """
+    differences = compare(runs, metric, resamples=resamples, seed=seed, scope=MACRO)
+    order = standings(runs, metric, differences)
+    higher = metric_facts(metric).higher_is_better
+    # (first, second) -> first less second, in both directions of a pair.
+    signs = {}
+    leads = {}
+    for item in differences:
+        value = item.estimate.value if higher else -item.estimate.value
+        differs = _differs(item, len(runs))
+        signs[item.first, item.second] = (value > 0) - (value < 0) if differs else 0
+        signs[item.second, item.first] = -signs[item.first, item.second]
+        leads[item.first, item.second] = item.estimate
+        leads[item.second, item.first] = turned(item.estimate)
+    means = [place.mean if higher else -place.mean for place in order]
+    ranks = []
+    for own, mean in zip(order, means, strict=True):
+        others = [other.label for other in order if other is not own]
+        ranks.append(
+            Rank(
+                own,
+                1 + sum(other > mean for other in means),
+                1 + sum(signs[other, own.label] > 0 for other in others),
+                len(order) - sum(signs[own.label, other] > 0 for other in others),
+                leads[own.label, order[0].label] if own is not order[0] else None,
+            )
+        )
+    return Ranking(metric, tuple(ranks), tuple(differences))
+
+
+def _differs(item: Difference, methods: int) -> bool:
+    """Whether a pair differs significantly, as one of the pairs that a method has with others."""
+    return item.estimate.p is not None and item.estimate.p * (methods - 1) < ALPHA
+
+
+def turned(estimate: Estimate) -> Estimate:
+    """Return the estimate of second less first."""
+    return Estimate(
+        -estimate.value,
+        None if estimate.high is None else -estimate.high,
+        None if estimate.low is None else -estimate.low,
+        None if estimate.above is None else 1 - estimate.above,
+        estimate.p,
+        estimate.detectable,
+        estimate.captures,
+    )
+
+
+def verdict(ranking: Ranking) -> str:
+    """Return one sentence: who wins by how much and how surely, or who ties.
+
+    A method wins where it is significantly better than every other one. Otherwise those that the
+    leader cannot be told from are named.
+    """
+    first, *rest = ranking.ranks
+    facts = metric_facts(ranking.metric)
+    unit = f" {facts.unit}" if facts.unit else ""
+    mean = f"{facts.label} {first.standing.mean:.{facts.digits}f}{unit}"
+    if not rest:
+        return f"{first.standing.label} has {mean} (macro mean); nothing is compared with it."
+    second = rest[0]
+    assert second.behind is not None
+    lead = turned(second.behind)
+    text = f"{lead.value:+.{facts.digits}f}{unit} against {second.standing.label}, the next"
+    if lead.low is not None and lead.high is not None:
+        ends = f"{lead.low:+.{facts.digits}f} to {lead.high:+.{facts.digits}f}"
+        surely = lead.above
+        if surely is not None and not facts.higher_is_better:
+            surely = 1 - surely
+        text += f" (95 % interval {ends}"
+        text += f", P(better) {surely:.3f})" if surely is not None else ")"
+    if first.standing.seeds != second.standing.seeds:
+        text += " over the seeds that both have"
+    if lead.captures == 1:
+        text += ", on one capture, which speaks of no other"
+    tied = _tied_with(first.standing.label, ranking)
+    if first.worst == 1:
+        return f"{first.standing.label} wins with {mean} (macro mean): {text}."
+    if lead.low is None:
+        return (
+            f"{first.standing.label} leads with {mean} (macro mean): {text}; nothing says how sure."
+        )
+    return (
+        f"No clear winner: {first.standing.label} leads with {mean} (macro mean), {text}, and "
+        f"is tied with {', '.join(tied)} (not significantly different"
+        + (f", Bonferroni over the {len(rest)} pairs of the leader)." if rest[1:] else ").")
+    )
+
+
+def _tied_with(label: str, ranking: Ranking) -> list[str]:
+    """Return the methods that one cannot be told from, best first."""
+    found = {
+        item.second if item.first == label else item.first
+        for item in ranking.differences
+        if label in (item.first, item.second) and not _differs(item, len(ranking.ranks))
+    }
+    return [item.standing.label for item in ranking.ranks if item.standing.label in found]
+
+
+_INTERVAL = (
+    "95 % intervals, P and p: paired bootstrap over captures, then seeds and blocks of frames, "
+    "read with Student's t (docs/statistics.md)."
+)
+#: Said under a table that has such scopes.
+ONE_CAPTURE = (
+    "Scopes of one capture speak only of further frames of that capture, not of further captures."
+)
+
+
+def scope_title(scope: str) -> str:
+    """Return the heading of a scope."""
+    if scope in PERTURBATIONS:
+        return perturbation(scope).heading
+    return {MACRO: "Macro", "single": "Single", "interacting": "Interacting"}.get(scope, scope)
+
+
+def estimate_columns(metric: str) -> tuple[Column, ...]:
+    """Return the columns of an estimate in a metric: value, interval."""
+    facts = metric_facts(metric)
+    unit = f" [{facts.unit}]" if facts.unit else ""
+    return (
+        Column(f"Difference{unit}", facts.digits),
+        Column("Low", facts.digits, group="95 % interval"),
+        Column("High", facts.digits, group="95 % interval"),
+    )
+
+
+def estimate_cells(estimate: Estimate) -> tuple[float | None, ...]:
+    """Return the cells of `estimate_columns`."""
+    return (estimate.value, estimate.low, estimate.high)
+
+
+def standings_table(metric: str, found: Sequence[Standing]) -> Table:
+    """Return one row a method, best first."""
+    facts = metric_facts(metric)
+    title = f"{facts.label} [{facts.unit}]" if facts.unit else facts.label
+    columns = (
+        Column("Method"),
+        Column(title, facts.digits, facts.higher_is_better),
+        Column("Ties"),
+        Column("Seeds", 0),
+        Column("Spread over seeds", facts.digits + 1),
+    )
+    rows = tuple((s.label, s.mean, s.ties, s.seeds, s.seed_deviation) for s in found)
+    note = (
+        "Macro mean. Methods that share a letter do not differ significantly (Holm over the "
+        "pairs, 5 %); the spread is the standard deviation of the mean over seeds."
+    )
+    return Table(f"{facts.label}: methods", columns, rows, (note,))
+
+
+def differences_table(metric: str, found: Sequence[Difference]) -> Table:
+    """Return one row a pair and scope."""
+    facts = metric_facts(metric)
+    columns = (
+        Column("First"),
+        Column("Second"),
+        Column("Scope"),
+        Column("Captures", 0),
+        *estimate_columns(metric),
+        Column("P(first better)", 3),
+        Column("p", 4),
+        Column("p (Holm)", 4),
+        Column("Detectable", facts.digits),
+    )
+    rows = tuple(
+        (
+            item.first,
+            item.second,
+            scope_title(item.scope),
+            item.estimate.captures,
+            *estimate_cells(item.estimate),
+            item.better,
+            item.estimate.p,
+            item.p_adjusted,
+            item.estimate.detectable,
+        )
+        for item in found
+    )
+    direction = "above" if facts.higher_is_better else "below"
+    notes = [
+        f"First less second; {direction} 0 the first is better. {_INTERVAL}",
+        "p (Holm): over the perturbations of a pair, and over the pairs for the macro mean. "
+        "Detectable: the true difference that such a comparison finds with 80 % probability.",
+    ]
+    if any(item.estimate.captures == 1 for item in found):
+        notes.append(ONE_CAPTURE)
+    return Table(f"{facts.label}: differences", columns, rows, tuple(notes))
+
+
+@dataclass(frozen=True)
+class MetricComparison:
+    """Methods compared in one metric."""
+
+    #: The methods, best first.
+    methods: list[Standing]
+    #: Every pair of methods in every scope.
+    differences: list[Difference]
+
+
+@dataclass(frozen=True, repr=False)
+class Comparison:
+    """Methods compared in one metric or several; `print` shows its tables."""
+
+    #: By metric, in the order asked for.
+    metrics: dict[str, MetricComparison]
+
+    def tables(self) -> list[Table]:
+        """Return two tables for each metric: the methods, and their differences."""
+        return [
+            table
+            for name, found in self.metrics.items()
+            for table in (
+                standings_table(name, found.methods),
+                differences_table(name, found.differences),
+            )
+        ]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return all numbers by metric, as JSON holds them."""
+        return {name: asdict(found) for name, found in self.metrics.items()}
+
+    def __repr__(self) -> str:
+        labels = [item.label for found in self.metrics.values() for item in found.methods]
+        return f"Comparison({', '.join(dict.fromkeys(labels))}; {', '.join(self.metrics)})"
+
+    def __str__(self) -> str:
+        return "\n".join(format_table(table, "md") for table in self.tables())
+
+    def _repr_markdown_(self) -> str:
+        return str(self)
+
+
+def compare_results(
+    results: Sequence[Results],
+    metrics: Sequence[str],
+    *,
+    all_metrics: bool = False,
+    resamples: int = RESAMPLES,
+    seed: int = 0,
+) -> Comparison:
+    """Compare the methods of several results.
+
+    Args:
+        results: of at least two methods on the same captures; results that differ only in the
+            seed count as one method.
+        metrics: names of metrics; one that not every result has is left out.
+        all_metrics: refuse a metric that not every result has.
+        resamples: bootstrap resamples of each interval, 100 to 1,000,000.
+        seed: seed of the resampling.
+
+    Raises:
+        UsageError: the results are of one method only or of different data, no metric is left,
+            or the number of resamples is out of range.
+    """
+    if not 100 <= resamples <= 1_000_000:
+        raise UsageError(f"{resamples} is not between 100 and 1000000", field="--resamples")
+    runs = group_runs(results)
+    refuse_unlike(runs)
+    if len(runs) < 2:
+        raise UsageError(
+            "there is only one method to compare",
+            field="RESULTS",
+            remedy="Results that differ only in the seed count as one method.",
+        )
+    wanted = [metric_facts(name).name for name in metrics]
+    names = common_metrics(runs, wanted)
+    if not names or (all_metrics and len(names) < len(wanted)):
+        raise UsageError("not every result has every metric asked for", field="--metric")
+    found = {}
+    for name in names:
+        differences = compare(runs, name, resamples=resamples, seed=seed)
+        found[name] = MetricComparison(standings(runs, name, differences), differences)
+    return Comparison(found)

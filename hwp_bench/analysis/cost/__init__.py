@@ -1,1 +1,0 @@
-"""Accuracy against time: curves of fits, what they say, and the Pareto front."""

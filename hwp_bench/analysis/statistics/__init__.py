@@ -1,1 +1,0 @@
-"""How sure a difference is: hierarchical bootstrap, several comparisons at once, ties."""

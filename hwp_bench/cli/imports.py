@@ -1,0 +1,343 @@
+"""Commands that make captures of other data: `data import ...` and `data import-video`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hwp_bench.cli.options import add_force, add_json, print_json
+
+if TYPE_CHECKING:
+    from hwp_bench.importers.video import ImportedClip
+
+_VIDEO = """examples:
+  hwp-bench data track hand.mp4
+  hwp-bench data import-video hand.mp4 --landmarks hand.npz my_capture
+  hwp-bench data import-video hand.mp4 --landmarks hand.npz my_capture --focal 1020 --side left
+  hwp-bench data import-video hand.mp4 --landmarks hand.npz part --frames 100:400 --stride 2
+
+LANDMARKS.npz comes from `hwp-bench data track` or another hand tracker and contains, for every
+frame of the video, image (F, 21, 2 or 3) in pixels, world (F, 21, 3) in metres and score (F,) in
+[0, 1]; score 0 means that no hand was seen. docs/video.md explains how to read the result.
+"""
+
+
+def add_video(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `import video`."""
+    parser.description = "Make a capture of a video of hands and the landmarks tracked in it."
+    parser.epilog = _VIDEO
+    parser.add_argument("video", type=Path, metavar="VIDEO", help="video file")
+    parser.add_argument("out", type=Path, metavar="OUT", help="capture folder to make")
+    parser.add_argument(
+        "--landmarks", type=Path, required=True, metavar="LANDMARKS.npz", help="tracked landmarks"
+    )
+    parser.add_argument(
+        "--side",
+        choices=("auto", "right", "left", "both"),
+        default="auto",
+        help="which hands (default: auto, one or both, as the landmarks and a fit to them show)",
+    )
+    # The name of the option until it took two hands.
+    parser.add_argument(
+        "--hand",
+        dest="side",
+        choices=("right", "left"),
+        default=argparse.SUPPRESS,
+        help=argparse.SUPPRESS,
+    )
+    parser.add_argument(
+        "--focal", type=float, metavar="PX", help="focal length of the whole frame; else estimated"
+    )
+    parser.add_argument(
+        "--masks", type=Path, metavar="DIR", help="your own masks, named by frame number"
+    )
+    parser.add_argument(
+        "--size", type=int, default=256, metavar="PX", help="edge of the frames (default: 256)"
+    )
+    parser.add_argument("--frames", metavar="A:B", help="only frames A to B-1")
+    parser.add_argument(
+        "--stride", type=int, default=1, metavar="K", help="every K-th frame (default: 1)"
+    )
+    parser.add_argument(
+        "--min-score",
+        type=float,
+        default=0.5,
+        metavar="S",
+        help="below this score a frame counts as without a hand (default: 0.5)",
+    )
+    parser.add_argument(
+        "--hand-model", default="anny", metavar="MODEL", help="anny (default) or mano:PATH"
+    )
+    parser.add_argument(
+        "--sheet", type=Path, metavar="PNG", help="write the overlay sheet here too"
+    )
+    parser.add_argument("--id", metavar="ID", help="capture id (default: the folder's name)")
+    parser.add_argument("--action", default="unknown", metavar="TEXT", help="what the hand does")
+    parser.add_argument("--device", default="unknown", metavar="TEXT", help="what recorded it")
+    parser.add_argument("--licence", default="unknown", metavar="TEXT", help="terms of use")
+    parser.add_argument(
+        "--perturbations",
+        default="",
+        metavar="NAMES",
+        help="perturbations in the clip, comma separated; their severities stay unknown",
+    )
+    add_force(parser)
+    add_json(parser, "print the numbers as JSON")
+
+
+def do_video(args: argparse.Namespace) -> int:
+    """Run `import video`."""
+    from hwp_bench.base.console import notice
+    from hwp_bench.base.files import check_places
+    from hwp_bench.importers.video import (
+        VideoImport,
+        finished_import,
+        import_video,
+        parse_frame_range,
+    )
+
+    inputs = {"VIDEO": args.video, "--landmarks": args.landmarks, "--masks": args.masks}
+    outputs = {"OUT": args.out, "--sheet": args.sheet}
+    check_places(outputs, inputs, replaces=args.force, makes_captures=True)
+    options = VideoImport(
+        side=args.side,
+        focal=args.focal,
+        masks=args.masks,
+        size=args.size,
+        frames=parse_frame_range(args.frames, args.stride),
+        id=args.id,
+        action=args.action,
+        device=args.device,
+        licence=args.licence,
+        perturbations=tuple(name for name in args.perturbations.split(",") if name),
+        hand_model=args.hand_model,
+        min_score=args.min_score,
+        sheet=args.sheet,
+        overwrite=args.force,
+    )
+    finished = finished_import(args.video, args.landmarks, args.out, options)
+    if finished is not None:
+        notice(f"{args.out} is complete: the same call has made it; --force imports again")
+        print(json.dumps(finished, indent=1) if args.json else f"capture: {args.out}")
+        return 0
+    clip = import_video(args.video, args.landmarks, args.out, options)
+    if args.json:
+        print_json(clip.facts())
+    else:
+        _print_video(clip, args)
+    return 0
+
+
+def _print_video(clip: ImportedClip, args: argparse.Namespace) -> None:
+    import numpy as np
+
+    from hwp_bench.importers.shared.writing import SHEET_NAME
+
+    facts = clip.facts()
+    video = clip.source.video
+    detected = " and ".join(
+        f"{side} hand detected in {hand.landmarks.detected.sum()}, fitted in "
+        f"{hand.parameters.valid.sum()}"
+        for side, hand in clip.hands.items()
+    )
+    print(f"capture: {args.out}, {facts['frames']} frames, {detected}")
+    if len(clip.hands) == 2:
+        print(f"exchanged by the tracker and put right: {clip.source.swaps} times")
+    for side, hand in clip.hands.items():
+        error, before = hand.error, hand.error_landmarks_only
+        print(
+            f"mean reprojection error of the 21 joints of the {side} hand: {error.mean:.2f} px at "
+            f"{video.width}x{video.height} (median {error.median:.2f}, 95th percentile "
+            f"{error.percentile_95:.2f}, worst joint {error.worst_landmark} "
+            f"{error.worst_landmark_mean:.2f}; without the tracker's constant offsets "
+            f"{error.without_offsets:.2f}; before the outline fit {before.mean:.2f})"
+        )
+    print(
+        f"overlap of mesh and mask: {facts['overlap']:.3f} "
+        f"(5th percentile {facts['overlap_percentile_5']:.3f}; "
+        f"before the outline fit {facts['overlap_landmarks_only']:.3f})"
+    )
+    origin = "given" if args.focal is not None else "estimated"
+    depths = np.concatenate([hand.parameters.transl[:, 2] for hand in clip.hands.values()])
+    near, far = np.percentile(depths, (0, 100))
+    print(f"focal length: {clip.focal:.0f} px ({origin}); at {near:.2f} to {far:.2f} m")
+    print(f"crop: {clip.source.windows.side} px squares, stored at {args.size} px")
+    sheet = args.sheet or args.out / "extra" / SHEET_NAME
+    print(f"look at: {sheet}")
+
+
+_WILDGHAND = """examples:
+  hwp-bench data import wildghand WildGHand/capture0_subsample3_single -o captures/capture0
+  hwp-bench data import wildghand WildGHand -o captures --mano mano_v1_2/models
+  hwp-bench data import wildghand WildGHand -o compat --mano mano_v1_2/models --official-compat
+
+DIR is one folder of the release (with output.pkl), or a folder of them; then OUT gets one capture
+for each. Pickles are read without running code from them. Without --mano the free hand is fitted,
+and its error is printed in mm. docs/data.md describes every step from the download to a table.
+"""
+
+
+def add_wildghand(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `import wildghand`."""
+    parser.description = "Make captures of the official HWP release."
+    parser.epilog = _WILDGHAND
+    parser.add_argument("folder", type=Path, metavar="DIR", help="folder of the release")
+    parser.add_argument(
+        "-o", "--out", type=Path, required=True, metavar="OUT", help="capture folder to make"
+    )
+    parser.add_argument(
+        "--mano",
+        type=Path,
+        metavar="MANO_DIR",
+        help="your MANO files; without them the free hand is fitted",
+    )
+    parser.add_argument(
+        "--official-compat",
+        action="store_true",
+        help="crop, intrinsics and translations as in the released loader",
+    )
+    parser.add_argument(
+        "--hand", choices=("right", "left"), help="the hand of a single-hand capture"
+    )
+    parser.add_argument("--id", metavar="ID", help="capture id (default: by the folder's name)")
+    parser.add_argument(
+        "--size", type=int, default=256, metavar="PX", help="edge of the frames (default: 256)"
+    )
+    parser.add_argument(
+        "--fps",
+        type=float,
+        default=30.0,
+        help="frame rate of the video before subsampling (default: 30)",
+    )
+    add_force(parser)
+    add_json(parser, "print the facts as JSON")
+
+
+def do_wildghand(args: argparse.Namespace) -> int:
+    """Run `import wildghand`."""
+    from hwp_bench.base.console import notice
+    from hwp_bench.base.files import check_places
+    from hwp_bench.importers.official import OfficialImport, import_official
+    from hwp_bench.importers.official.folders import find_folders
+
+    check_places(
+        {"--out": args.out},
+        {"DIR": args.folder, "--mano": args.mano},
+        replaces=args.force,
+        makes_captures=True,
+    )
+    options = OfficialImport(
+        mano=args.mano,
+        official_compat=args.official_compat,
+        hand=args.hand,
+        size=args.size,
+        video_fps=args.fps,
+        overwrite=args.force,
+    )
+    folders = find_folders(args.folder, args.id)
+    several = folders[0].path != args.folder
+    results = []
+    for folder in folders:
+        out = args.out / folder.id if several else args.out
+        facts = import_official(folder, out, options)
+        for warning in facts["warnings"]:
+            notice(f"warning: {folder.path}: {warning}")
+        results.append({"out": str(out), **facts})
+    if args.json:
+        print_json(results)
+    else:
+        for facts in results:
+            _print_wildghand(facts)
+    return 0
+
+
+def _print_wildghand(facts: dict[str, Any]) -> None:
+    valid = ", ".join(f"{side} in {count}" for side, count in facts["frames_valid"].items())
+    print(f"capture: {facts['out']}, {facts['frames']} frames, hands: {valid}")
+    for side, error in facts["vertex_error_mm"].items():
+        print(
+            f"{side} hand ({facts['hand_model']}): {error:.2f} mm from the tracker's vertices, "
+            f"joints {facts['joint_error_px'][side]:.2f} px from its joints, "
+            f"{100 * facts['vertices_on_mask'][side]:.0f} % of its vertices on the mask"
+        )
+    print(f"look at: {facts['out']}/extra/overlay.png")
+
+
+_INTERHAND26M = """examples:
+  hwp-bench data import interhand26m InterHand2.6M touchrom-15 -o captures/touchrom-15
+  hwp-bench data import interhand26m InterHand2.6M handscratch-16 -o scratch --mano mano_v1_2/models
+  hwp-bench data import interhand26m InterHand2.6M Capture0/ROM01_No_Interaction/cam400262 -o x
+
+DIR holds images/ and annotations/. The paper's three sequences have the names touchrom-15,
+touchrom-16 and handscratch-16. The data set may not be used commercially (CC BY-NC 4.0).
+"""
+
+
+def add_interhand26m(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `import interhand`."""
+    parser.description = "Make a capture of a sequence of InterHand2.6M."
+    parser.epilog = _INTERHAND26M
+    parser.add_argument("folder", type=Path, metavar="DIR", help="folder of the data set")
+    parser.add_argument("sequence", metavar="SEQUENCE", help="a name, or CaptureN/SEQUENCE/camID")
+    parser.add_argument(
+        "-o", "--out", type=Path, required=True, metavar="OUT", help="capture folder to make"
+    )
+    parser.add_argument(
+        "--mano",
+        type=Path,
+        metavar="MANO_DIR",
+        help="your MANO files; without them the free hand is fitted",
+    )
+    parser.add_argument(
+        "--size", type=int, default=256, metavar="PX", help="edge of the frames (default: 256)"
+    )
+    parser.add_argument(
+        "--fps",
+        type=float,
+        default=5.0,
+        help="frame rate of the annotated frames, 5 or 30 (default: 5)",
+    )
+    parser.add_argument(
+        "--side",
+        choices=("auto", "right", "left", "both"),
+        default="auto",
+        help="which hands (default: auto, those that the sequence is said to show)",
+    )
+    add_force(parser)
+    add_json(parser, "print the facts as JSON")
+
+
+def do_interhand26m(args: argparse.Namespace) -> int:
+    """Run `import interhand`."""
+    from hwp_bench.base.files import check_places
+    from hwp_bench.importers.interhand import InterHandImport, find_sequence, import_interhand
+
+    check_places(
+        {"--out": args.out},
+        {"DIR": args.folder, "--mano": args.mano},
+        replaces=args.force,
+        makes_captures=True,
+    )
+    options = InterHandImport(
+        mano=args.mano, size=args.size, fps=args.fps, side=args.side, overwrite=args.force
+    )
+    facts = import_interhand(args.folder, find_sequence(args.sequence), args.out, options)
+    if args.json:
+        print_json({"out": str(args.out), **facts})
+        return 0
+    print(f"capture: {args.out}, {facts['frames']} frames of {facts['split']}")
+    for side, error in facts["errors"].items():
+        joints = "unknown" if error["joints_mm"] is None else f"{error['joints_mm']:.2f} mm"
+        print(f"{side} hand: in {error['frames_valid']} frames, joints {joints} from the annotated")
+    print(f"look at: {args.out}/extra/overlay.png")
+    return 0
+
+
+#: The arguments and the work of each command, where `main` looks for them.
+COMMANDS = {
+    "video": (add_video, do_video),
+    "wildghand": (add_wildghand, do_wildghand),
+    "interhand26m": (add_interhand26m, do_interhand26m),
+}

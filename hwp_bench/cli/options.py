@@ -1,0 +1,196 @@
+"""Options that several commands share, what they stand for, and how commands print JSON."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tomllib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hwp_bench.base.errors import UsageError, has_odd_characters, shown
+from hwp_bench.base.records import parse_toml
+from hwp_bench.taxonomy import SUITES
+
+if TYPE_CHECKING:
+    from hwp_bench.capture.splits import Split
+
+# Deepest table that a dotted name leads to.
+_MOST_TABLES = 8
+# What begins a string, a list or a table.
+_OPENING = frozenset("\"'[{")
+
+
+def add_json(parser: argparse.ArgumentParser, what: str = "print JSON") -> None:
+    """Add `--json`, for which a command prints with `print_json`."""
+    parser.add_argument("--json", action="store_true", help=what)
+
+
+def print_json(value: Any) -> None:
+    """Print a value as JSON on standard output."""
+    print(json.dumps(value, indent=1))
+
+
+def add_results(parser: argparse.ArgumentParser, nargs: str = "+", more: str = "") -> None:
+    """Add RESULTS, read by `report.sources.read_sources` or `results.read_all`."""
+    text = f"results folder, results.json, or ablation folder{more}"
+    parser.add_argument("results", nargs=nargs, metavar="RESULTS", help=text)
+
+
+def add_capture_folders(parser: argparse.ArgumentParser, purpose: str) -> None:
+    """Add `--captures`, for what results do not say of their captures."""
+    parser.add_argument(
+        "--captures",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="FOLDER",
+        help=f"capture folders, for {purpose} (simulated ones are found in the cache)",
+    )
+
+
+def add_suite_or_captures(parser: argparse.ArgumentParser) -> None:
+    """Add `--suite` and `--capture`, of which one can be given, and `--splits`."""
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument(
+        "--suite",
+        choices=SUITES,
+        default="mini",
+        help="simulated captures, rendered on first use (default mini)",
+    )
+    what.add_argument(
+        "--capture",
+        nargs="+",
+        action="extend",
+        metavar="PATH",
+        help="capture folders, instead of a suite",
+    )
+    add_splits(parser)
+
+
+def add_splits(parser: argparse.ArgumentParser) -> None:
+    """Add `--splits`, which `splits_of` reads."""
+    parser.add_argument("--splits", help="split file (default: the 80/10/10 rule)")
+
+
+def add_force(parser: argparse.ArgumentParser) -> None:
+    """Add `--force`, with which a command replaces a capture."""
+    parser.add_argument("--force", action="store_true", help="replace an existing capture")
+
+
+def splits_of(args: argparse.Namespace) -> Mapping[str, Split] | None:
+    """Return the splits of the file that was named; None takes the rule."""
+    from hwp_bench.capture.splits import read_splits
+
+    return read_splits(args.splits) if args.splits else None
+
+
+def captures_of(places: Sequence[str] | None, file: Path) -> list[Path]:
+    """Return the capture folders that a result is verified with.
+
+    Args:
+        places: captures or folders of captures; None takes the result's suite, rendered where
+            it is not in the cache.
+        file: the result file.
+
+    Raises:
+        UsageError: the places hold no capture, or the result is of no suite.
+    """
+    from hwp_bench.evaluation.verify import capture_folders
+    from hwp_bench.results import read_results
+    from hwp_bench.sim import ensure_suite
+    from hwp_bench.sim.produce.suites import suite_names
+
+    if places:
+        folders = capture_folders([Path(place) for place in places])
+        if not folders:
+            raise UsageError("there is no capture", field="--captures")
+        return folders
+    suite = read_results(file).suite
+    if suite not in suite_names():
+        raise UsageError(
+            f"was not made on a suite ({suite})",
+            where=file,
+            field="suite",
+            remedy="Say where its captures lie with --captures.",
+        )
+    return ensure_suite(suite)
+
+
+def add_actions(
+    parser: argparse.ArgumentParser,
+) -> Callable[..., argparse.ArgumentParser]:
+    """Let a command have actions; returns what adds one: `action(name, text, act, epilog)`.
+
+    `args.action` is the name, and `args.act` the function of the one that is chosen.
+    """
+    actions = parser.add_subparsers(
+        dest="action", required=True, metavar="ACTION", help="what to do"
+    )
+
+    def action(
+        name: str, text: str, act: Callable[..., int] | None = None, epilog: str | None = None
+    ) -> argparse.ArgumentParser:
+        added = actions.add_parser(
+            name,
+            help=text,
+            description=f"{text[0].upper()}{text[1:]}.",
+            epilog=epilog,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        added.set_defaults(act=act)
+        return added
+
+    return action
+
+
+def overrides(texts: Iterable[str]) -> dict[str, Any]:
+    """Read texts of the form `NAME=VALUE`.
+
+    Args:
+        texts: a name, or `name.field` for a field of a table, and a value as TOML writes it; a
+            value that is not TOML is text, so that words need no quotation marks. The last value
+            of a name wins.
+
+    Raises:
+        UsageError: a text is not of this form, its value is too large, too deep or no Unicode, or
+            begins as a list, table or string of TOML and is none; or one name is a value and a
+            table.
+    """
+    found: dict[str, Any] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not equals or not all(part.isidentifier() for part in name.split(".")):
+            raise UsageError(f"{text[:100]!r} is not NAME=VALUE", field="--set")
+        if name.count(".") > _MOST_TABLES:
+            raise UsageError(f"{text[:100]!r} names too deep a table", field="--set")
+        place = f"{name[:100]}={shown(value)[:40]}"
+        try:
+            content = parse_toml(f"value = {value}", where="--set", field=place, error=UsageError)
+            found[name] = content["value"]
+        except UsageError as error:
+            # A word without quotation marks is text; what is TOML but out of bounds is not.
+            if not isinstance(error.__cause__, tomllib.TOMLDecodeError):
+                raise
+            if value.lstrip()[:1] in _OPENING:
+                problem = f"begins as TOML and is none ({error.__cause__})"
+                remedy = "Close it; a text that begins so is written in quotation marks."
+                raise UsageError(problem, where="--set", field=place, remedy=remedy) from error
+            if has_odd_characters(value):
+                problem = "holds a control character, or cannot be Unicode"
+                raise UsageError(problem, where="--set", field=place) from error
+            found[name] = value
+    _check_tables(found)
+    return found
+
+
+def _check_tables(found: Mapping[str, Any]) -> None:
+    """Refuse a name that is a value and, in another one, a table."""
+    for name in found:
+        parts = name.split(".")
+        for count in range(1, len(parts)):
+            above = ".".join(parts[:count])
+            if not isinstance(found.get(above, {}), dict):
+                problem = f"{above!r} is a value, and a table in {name!r}"
+                raise UsageError(problem, field="--set", remedy="Give one of them.")

@@ -1,0 +1,418 @@
+"""Commands about results: `table`, `compare`, `cost`, `report` and `verify`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hwp_bench.cli.options import (
+    add_capture_folders,
+    add_json,
+    add_results,
+    add_splits,
+    captures_of,
+    print_json,
+    splits_of,
+)
+
+if TYPE_CHECKING:
+    from hwp_bench.evaluation.verify import Verification
+
+_TABLES = (
+    "overall",
+    "rank",
+    "cost",
+    "captures",
+    "perturbations",
+    "details",
+    "micro",
+    "paper",
+    "robustness",
+    "severity",
+    "novelty",
+    "outline",
+    "free-view",
+    "bias",
+    "seeds",
+)
+_TABLE = """examples:
+  hwp-bench table runs/plain-mini
+  hwp-bench table runs/plain-mini runs/mine-mini --by perturbations
+  hwp-bench table runs/* --by rank       # ranks with intervals; who is tied with whom
+  hwp-bench table runs/* --by cost       # score, seconds, memory, seconds on one core
+  hwp-bench table runs/* --by overall --format tex > table.tex
+  hwp-bench table runs/mine-mini runs/mine-mini-clean runs/plain-mini --by robustness --base plain
+  hwp-bench table runs/mine-seed* --by seeds
+  hwp-bench table runs/plain-mini runs/mine-mini --by novelty   # where training showed little
+  hwp-bench table runs/plain-mini runs/mine-mini --by outline   # what is drawn outside of the hand
+  hwp-bench table runs/plain-mini runs/mine-mini --by free-view   # from all around
+  hwp-bench table runs/mine-mini runs/plain-mini --paper 5 --published   # layout of table 5
+  hwp-bench table --published                                            # the paper's numbers
+
+Results on different data stand in blocks of their own and are never ranked together. The output is
+as wide as the terminal, 80 columns in a pipe; COLUMNS=200 asks for more.
+docs/tables.md says what each table shows and which command makes each table of the paper.
+"""
+
+
+def add_table(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `table`."""
+    parser.epilog = _TABLE
+    add_results(parser, "*")
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument(
+        "--by", choices=_TABLES, default="overall", help="which table (default overall)"
+    )
+    which.add_argument(
+        "--paper",
+        type=int,
+        choices=range(1, 11),
+        metavar="N",
+        help="the layout of the paper's table N, 1 to 10, in protocol paper-wildghand",
+    )
+    parser.add_argument(
+        "--published",
+        action="store_true",
+        help="append the paper's own numbers, marked as published on other data",
+    )
+    parser.add_argument(
+        "--base", metavar="NAME", help="robustness: method that the gap is counted from"
+    )
+    add_capture_folders(parser, "severities, novelty and outlines")
+    parser.add_argument(
+        "--format",
+        choices=("terminal", "md", "tex", "csv", "json"),
+        default="terminal",
+        help="format of the table (default terminal)",
+    )
+    add_json(parser, "the same as --format json")
+
+
+def do_table(args: argparse.Namespace) -> int:
+    """Run `table`."""
+    from hwp_bench.base.console import print_document
+    from hwp_bench.base.tables import format_table, print_table
+    from hwp_bench.report.requested_table import TableRequest, make_table
+
+    table = make_table(
+        TableRequest(
+            paths=args.results,
+            by=args.by,
+            paper=args.paper,
+            published=args.published,
+            base=args.base,
+            captures=args.captures,
+        )
+    )
+    form = "json" if args.json else args.format
+    if form == "terminal":
+        print_table(table)
+    else:
+        print_document(format_table(table, form))
+    return 0
+
+
+_COMPARE = """examples:
+  hwp-bench compare runs/mine-mini runs/plain-mini
+  hwp-bench compare runs/mine-seed*/ runs/plain-seed*/      # seeds of one method go together
+  hwp-bench compare runs/mine runs/other runs/plain --metric psnr ssim --json
+  hwp-bench compare runs/mine runs/plain --format md > differences.md
+
+Prints every method with its tie group, and the paired difference of every pair (the first named
+less the second) over all captures, single and interacting hands, and each perturbation, with 95 %
+interval, P(better) and Holm-adjusted p. Results on different data, splits, protocols or choices
+of training frames are refused (exit status 2).
+"""
+
+
+def add_compare(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `compare`."""
+    parser.epilog = _COMPARE
+    add_results(parser)
+    parser.add_argument(
+        "--metric",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="NAME",
+        help="metrics to compare (default: the headline metrics that all have)",
+    )
+    parser.add_argument("--resamples", type=int, default=10_000, help="default 10000")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the resampling")
+    parser.add_argument(
+        "--format",
+        choices=("terminal", "md", "tex", "csv"),
+        default="terminal",
+        help="format of the tables (default terminal)",
+    )
+    add_json(parser, "print JSON with full precision")
+
+
+def do_compare(args: argparse.Namespace) -> int:
+    """Run `compare`."""
+    from hwp_bench.analysis.compare import compare_results
+    from hwp_bench.base.console import print_document
+    from hwp_bench.base.tables import format_table, print_table
+    from hwp_bench.report.tables import HEADLINE
+    from hwp_bench.results import read_all
+    from hwp_bench.results.schema import add_isolation_note
+
+    results = read_all(args.results)
+    comparison = compare_results(
+        results,
+        args.metric or HEADLINE,
+        all_metrics=bool(args.metric),
+        resamples=args.resamples,
+        seed=args.seed,
+    )
+    if args.json:
+        print_json(comparison.as_dict())
+        return 0
+    for plain in comparison.tables():
+        table = add_isolation_note(plain, results)
+        if args.format == "terminal":
+            print_table(table)
+        else:
+            print_document(format_table(table, args.format) + "\n")
+    return 0
+
+
+_COST = """examples:
+  hwp-bench cost runs/plain-mini runs/mine-mini
+  hwp-bench cost runs/mine-mini --reference runs/plain-mini -o runs/cost
+  hwp-bench cost runs/ablation --metric oriented_distance     # every variant of an ablation
+  hwp-bench cost runs/* --budgets 10 30 120 --json
+
+Prints scores after fixed times, times to given scores, where the time goes, and which method has
+the best score when; writes the tables and the figure of score against seconds (PNG and SVG) to the
+output folder. Results on different data are analysed apart: their tables say `Data A`, `Data B`,
+... and their figures go to folders of these names.
+"""
+
+
+def add_cost(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `cost`."""
+    parser.epilog = _COST
+    add_results(parser, more="; seeds of a method go together")
+    parser.add_argument(
+        "--reference",
+        metavar="RESULTS",
+        help="result whose final score is a target (default: the plain baseline, if it is there)",
+    )
+    parser.add_argument("--metric", default="psnr", help="metric of the curves (default psnr)")
+    parser.add_argument(
+        "--budgets",
+        nargs="+",
+        type=float,
+        default=[5.0, 15.0, 60.0, 300.0],
+        metavar="SECONDS",
+        help="times at which scores are read (default 5 15 60 300, those that are reached)",
+    )
+    parser.add_argument(
+        "-o", "--out", default="hwp-cost", help="folder to write (default hwp-cost)"
+    )
+    add_json(parser, "print JSON with the curves")
+
+
+def do_cost(args: argparse.Namespace) -> int:
+    """Run `cost`."""
+    from dataclasses import replace
+
+    from hwp_bench.analysis.cost import CostAnalysis, analyse_cost
+    from hwp_bench.analysis.pairing import group_runs
+    from hwp_bench.base.console import notice
+    from hwp_bench.base.errors import UsageError
+    from hwp_bench.base.files import check_places
+    from hwp_bench.base.tables import print_table
+    from hwp_bench.metrics import metric
+    from hwp_bench.report.figures import write_cost
+    from hwp_bench.report.sources import (
+        DataGroup,
+        data_groups,
+        data_key,
+        read_sources,
+        source_folders,
+    )
+    from hwp_bench.results import read_all
+
+    metric(args.metric)
+    for budget in args.budgets:
+        if not 0 < budget < float("inf"):
+            raise UsageError(f"{budget} is not above 0", field="--budgets")
+    reference = None
+    if args.reference:
+        named = group_runs(read_all([args.reference]))
+        if len(named) != 1:
+            raise UsageError("names more than one method", field="--reference")
+        reference = named[0]
+    found: list[tuple[DataGroup, CostAnalysis]] = []
+    sources = read_sources(args.results, repeats=False)
+    check_places({"--out": args.out}, {"RESULTS": source_folders(sources)})
+    groups = data_groups(sources)
+    for group in groups:
+        results = [source.results for source in group.sources]
+        # With several groups a reference is only of the one that it shares its data with.
+        fits = reference is None or data_key(reference.first) == data_key(results[0])
+        try:
+            analysis = analyse_cost(
+                group_runs(results),
+                args.metric,
+                budgets=sorted(set(args.budgets)),
+                reference=reference if fits or len(groups) == 1 else None,
+            )
+        except UsageError as error:
+            if len(groups) == 1 or (group is groups[-1] and not found):
+                raise
+            notice(f"left out, data {group.label}: {error}")
+            continue
+        found.append((group, analysis))
+        if not args.json:
+            if group.label:
+                print(f"Data {group.label}: {group.text}")
+            for table in analysis.tables.values():
+                head = f"Data {group.label}: " if group.label else ""
+                print_table(replace(table, caption=head + table.caption))
+        for figure in write_cost(Path(args.out) / group.label, analysis):
+            notice(f"figure: {figure}")
+    if args.json:
+        several = {"groups": [{"data": g.label, "text": g.text, **a.as_object()} for g, a in found]}
+        whole = several if len(found) > 1 else found[0][1].as_object()
+        print_json(whole)
+    return 0
+
+
+_REPORT = """examples:
+  hwp-bench report runs/plain-mini -o reports/plain
+  hwp-bench report runs/mine-mini runs/plain-mini -o reports/mine
+  hwp-bench report runs/mine-mini runs/mine-mini-clean runs/plain-mini --base plain -o reports/mine
+  hwp-bench report runs/* -o reports/all
+  hwp-bench report runs/wildghand-mini --avatar-pages -o reports/wildghand
+  hwp-bench report runs/mine-captures --captures my_captures/* -o reports/mine
+
+Results on different data get a page each, A/index.html, B/index.html, ..., and index.html leads to
+them.
+
+Writes one HTML page, index.html, that needs no network: tables, score against seconds, scores by
+perturbation with intervals, a strip for every capture, images, environment and digests.
+"""
+
+
+def add_report(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `report`."""
+    parser.epilog = _REPORT
+    add_results(parser)
+    parser.add_argument("-o", "--out", required=True, metavar="DIR", help="folder of the page")
+    add_capture_folders(parser, "severities")
+    parser.add_argument(
+        "--base", metavar="NAME", help="method that shares of the gap are counted from"
+    )
+    parser.add_argument(
+        "--avatar-pages",
+        action="store_true",
+        help="lead to pages of avatars (captures/ID/avatar.html in a results folder); they run "
+        "the scripts of whoever made them",
+    )
+    parser.add_argument("--title", help="heading of the page (default: the methods)")
+
+
+def do_report(args: argparse.Namespace) -> int:
+    """Run `report`."""
+
+    from hwp_bench.base.console import notice
+    from hwp_bench.base.files import check_places
+    from hwp_bench.report.page import write_reports
+    from hwp_bench.report.sources import read_sources, source_folders
+
+    sources = read_sources(args.results, repeats=False)
+    inputs = {"RESULTS": source_folders(sources), "--captures": args.captures}
+    check_places({"--out": args.out}, inputs)
+    pages = write_reports(
+        Path(args.out),
+        sources,
+        args.captures,
+        base=args.base,
+        title=args.title,
+        avatar_pages=args.avatar_pages,
+    )
+    for page in pages:
+        notice(f"report: {page} ({page.stat().st_size / 1e6:.1f} MB)")
+    return 0
+
+
+_VERIFY = """examples:
+  hwp-bench verify runs/plain-mini
+  hwp-bench verify runs/mine --captures my_captures
+  hwp-bench verify runs/ablation --json          # every result of an ablation
+
+Recomputes the digests of captures, splits and predictions, and every score, from the predictions
+that lie next to the result. PSNR and SSIM of some frames of each capture are also computed with
+scikit-image. Exit status 0: everything is as the result says; 1: something differs.
+"""
+#: Discrepancies that are printed for one result.
+_SHOWN = 20
+
+
+def add_verify(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `verify`."""
+    parser.epilog = _VERIFY
+    add_results(parser)
+    parser.add_argument(
+        "--captures",
+        nargs="+",
+        action="extend",
+        metavar="DIR",
+        help="captures, or folders of captures (default: the result's suite)",
+    )
+    add_splits(parser)
+    add_json(parser)
+
+
+def do_verify(args: argparse.Namespace) -> int:
+    """Run `verify`."""
+    from dataclasses import asdict
+
+    from hwp_bench.base.console import track
+    from hwp_bench.evaluation.verify import verify_results
+    from hwp_bench.results import result_files
+
+    splits = splits_of(args)
+    files = [file for path in args.results for file in result_files(path)]
+    outcomes = []
+    for file in track(files, "verify"):
+        outcomes.append(verify_results(file, captures_of(args.captures, file), splits))
+    if args.json:
+        print_json([asdict(outcome) for outcome in outcomes])
+    else:
+        for outcome in outcomes:
+            _print_verify(outcome)
+    return 1 if any(outcome.discrepancies for outcome in outcomes) else 0
+
+
+def _print_verify(outcome: Verification) -> None:
+    from hwp_bench.base.tables import Column, Table, print_table
+
+    shown = outcome.discrepancies[:_SHOWN]
+    if shown:
+        titles = ("capture", "what", "the result says", "found")
+        rows = tuple((d.capture or "all", d.what, d.recorded, d.found) for d in shown)
+        print_table(Table(outcome.file, tuple(map(Column, titles)), rows, ranked=False))
+        rest = len(outcome.discrepancies) - len(shown)
+        if rest:
+            print(f"and {rest} more")
+    verdict = f"{len(outcome.discrepancies)} differences" if shown else "holds"
+    print(f"{outcome.file}: {verdict} ({outcome.captures} captures, {outcome.frames} frames)")
+    if outcome.cross_checked and not shown:
+        print(f"  scikit-image agrees on PSNR and SSIM of {outcome.cross_checked} frames")
+    for note in outcome.notes:
+        print(f"  {note}")
+
+
+#: The arguments and the work of each command, where `main` looks for them.
+COMMANDS = {
+    "table": (add_table, do_table),
+    "compare": (add_compare, do_compare),
+    "cost": (add_cost, do_cost),
+    "report": (add_report, do_report),
+    "verify": (add_verify, do_verify),
+}

@@ -1,0 +1,644 @@
+"""The board: a row for each method and suite, over its seeds, ranked with intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+from markupsafe import Markup
+
+from hwp_bench.analysis.compare import Rank, compare, rank_methods, verdict
+from hwp_bench.analysis.cost import analyse_cost
+from hwp_bench.analysis.pairing import MACRO, group_runs, same_but_seed
+from hwp_bench.base.errors import UsageError
+from hwp_bench.base.tables import Cell, Column, Table
+from hwp_bench.capture.splits import split_for
+from hwp_bench.evaluation.sentences import find_missing
+from hwp_bench.leaderboard.entries import BADGES, LEVELS, Entry
+from hwp_bench.leaderboard.rules import HEADLINE, current, source_of, tables_of, takes_over
+from hwp_bench.leaderboard.suite_data import on_current_data
+from hwp_bench.metrics import HWP_V1
+from hwp_bench.metrics import metric as metric_facts
+from hwp_bench.metrics.score import CaptureScores, aggregate
+from hwp_bench.report.figures import draw_pareto, inline_svg
+from hwp_bench.report.study_tables import METRIC
+from hwp_bench.report.tables import score_column
+from hwp_bench.results import Results
+from hwp_bench.results.schema import score_rows
+from hwp_bench.sim.produce.suites import suite
+from hwp_bench.sim.scene.episodes import moments, severity
+from hwp_bench.taxonomy import PERTURBATIONS, perturbation
+
+#: The badge of a row is the first of these that one of its entries has.
+_LEAST = ("differs", "disputed", *(b for b in BADGES if b not in ("differs", "disputed")))
+
+
+@dataclass(frozen=True)
+class BoardRow:
+    """One method with one budget and one suite, with an entry for each seed."""
+
+    #: Its entries, the lowest seed first. Not empty.
+    entries: tuple[Entry, ...]
+
+    @property
+    def first(self) -> Results:
+        """The results of the lowest seed."""
+        return self.entries[0].results
+
+    @property
+    def compared(self) -> list[Results]:
+        """The results of every seed, as they are compared with other rows."""
+        return [on_current_data(entry.results) for entry in self.entries]
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """The seeds, rising."""
+        return tuple(entry.results.seed for entry in self.entries)
+
+    @property
+    def whole(self) -> bool:
+        """Whether no capture or test frame of the suite is missing."""
+        return not find_missing(self.first)
+
+    @property
+    def scores(self) -> Mapping[str, float]:
+        """Headline scores by metric, means over the seeds."""
+        found = [entry.results.scores for entry in self.entries]
+        return {name: sum(one[name] for one in found) / len(found) for name in found[0]}
+
+    @property
+    def fit_seconds(self) -> float | None:
+        """Mean seconds of a fit over captures and seeds; None where the method says none."""
+        fits = [
+            capture.fit_seconds
+            for entry in self.entries
+            for capture in entry.results.captures
+            if capture.fit_seconds is not None
+        ]
+        return sum(fits) / len(fits) if fits else None
+
+    @property
+    def level(self) -> str:
+        """How far every one of its entries was checked, one of `records.LEVELS`."""
+        return min((entry.level for entry in self.entries), key=LEVELS.index)
+
+    @property
+    def badge(self) -> str:
+        """The least that the badge of one of its entries says, one of `records.BADGES`."""
+        return min((entry.badge for entry in self.entries), key=_LEAST.index)
+
+
+@dataclass(frozen=True)
+class MethodRow:
+    """A method on one suite: the row that stands for it, and all that it had there before."""
+
+    #: Its newest row among those that were checked furthest.
+    row: BoardRow
+    #: What the board calls it: its title, with who stands for it where a title is there twice.
+    label: str
+    #: Entries of the method on the suite that are not in the row, the newest first.
+    older: tuple[Entry, ...] = ()
+
+
+def board_rows(entries: Iterable[Entry]) -> list[BoardRow]:
+    """Put entries that differ in nothing but the seed together, in the order given.
+
+    Entries of two submitters, or that were checked differently far, are never one row: nobody
+    moves a row by another seed of it. An entry that lacks a part of its suite, and a second one of
+    the same seed, has a row to itself.
+
+    Args:
+        entries: of one suite and one version of the protocol.
+    """
+    groups: dict[object, list[Entry]] = {}
+    for entry in entries:
+        key: object = (same_but_seed(entry.results), entry.submission.by, entry.level)
+        seeds = {other.results.seed for other in groups.get(key, [])}
+        if find_missing(entry.results) or entry.results.seed in seeds:
+            key = entry.name
+        groups.setdefault(key, []).append(entry)
+    return [
+        BoardRow(tuple(sorted(group, key=lambda entry: entry.results.seed)))
+        for group in groups.values()
+    ]
+
+
+def method_rows(entries: Sequence[Entry]) -> list[MethodRow]:
+    """Return one row for each method, in the order in which the methods come.
+
+    The row of a method is whole where one is, checked as far as one is, and of these the newest.
+
+    Args:
+        entries: all of one suite and one version of the protocol, those that others revise too.
+    """
+    methods: dict[object, list[Entry]] = {}
+    for entry in entries:
+        methods.setdefault(source_of(entry), []).append(entry)
+    chosen = [max(board_rows(current(own)), key=_standing) for own in methods.values()]
+    return [
+        MethodRow(row, label, _older(row, own))
+        for row, label, own in zip(chosen, _labels(chosen), methods.values(), strict=True)
+    ]
+
+
+def _standing(row: BoardRow) -> tuple[bool, int, str, str]:
+    newest = max(entry.results.started for entry in row.entries)
+    return row.whole, LEVELS.index(row.level), newest, row.entries[0].name
+
+
+def _older(row: BoardRow, own: Iterable[Entry]) -> tuple[Entry, ...]:
+    names = {entry.name for entry in row.entries}
+    others = [entry for entry in own if entry.name not in names]
+    return tuple(sorted(others, key=lambda e: (e.results.started, e.name), reverse=True))
+
+
+def _labels(rows: Sequence[BoardRow]) -> list[str]:
+    """Titles, with the submitter and at last the entry where they do not tell rows apart."""
+    titles = [row.first.method.title for row in rows]
+    named = [
+        f"{title} (by {row.entries[0].submission.by or 'somebody who is not named'})"
+        for title, row in zip(titles, rows, strict=True)
+    ]
+    entries = [f"{title} ({row.entries[0].name})" for title, row in zip(titles, rows, strict=True)]
+    labels = []
+    for place, title in enumerate(titles):
+        texts = ((title, titles), (named[place], named), (entries[place], entries))
+        labels.append(next(text for text, all_ in texts if all_.count(text) == 1))
+    return labels
+
+
+#: By capture and perturbation: mean severity of the frames that show it, rounded.
+Severities = Mapping[str, Mapping[str, int]]
+
+
+@cache
+def suite_severities(name: str) -> Severities:
+    """Return how severe each perturbation of each capture of a suite is.
+
+    It is read from the scenes, so that no capture has to be on this machine: the mean over the
+    frames to learn from that show the perturbation, rounded, as `hwp-bench table --by severity`
+    takes it from captures.
+
+    Args:
+        name: a suite.
+
+    Raises:
+        UsageError: there is no such suite.
+    """
+    found: dict[str, dict[str, int]] = {}
+    for item in suite(name):
+        test = set(split_for(item.scene.id, item.frame_count).test.tolist())
+        learnt = [
+            moment
+            for frame, moment in enumerate(moments(item.frame_count).tolist())
+            if frame not in test
+        ]
+        own = found.setdefault(item.scene.id, {})
+        for call in item.scene.effects:
+            shown = [value for moment in learnt if (value := severity(call, moment))]
+            own[call.kind] = round(sum(shown) / len(shown)) if shown else 0
+    return found
+
+
+def at_severity(
+    captures: Sequence[CaptureScores], severities: Severities, level: int
+) -> list[CaptureScores]:
+    """Return the captures that have a perturbation of one severity, with these perturbations only.
+
+    Args:
+        captures: scores of captures of the suite.
+        severities: what `suite_severities` returned for it.
+        level: 1 to 5.
+
+    Returns:
+        Fewer captures; empty where none has a perturbation of that severity.
+    """
+    found = []
+    for capture in captures:
+        own = severities.get(capture.id, {})
+        kept = tuple(name for name in capture.perturbations if own.get(name) == level)
+        if kept:
+            found.append(replace(capture, perturbations=kept))
+    return found
+
+
+#: Metrics of the board.
+METRICS = ("psnr", "ssim", "oriented_distance")
+#: Scopes that can be chosen, with their headings.
+SCOPES = {
+    "macro": "All perturbations (macro mean)",
+    "single": "Single hands",
+    "interacting": "Interacting hands",
+    **{name: perturbation(name).heading for name in PERTURBATIONS},
+}
+#: Severities that can be chosen.
+SEVERITIES = (1, 2, 3, 4, 5)
+
+
+@dataclass(frozen=True)
+class OlderRun:
+    """An entry of a method that does not stand for it any more, or not yet."""
+
+    #: Name of the entry.
+    name: str
+    #: Day of the evaluation, ISO 8601.
+    date: str
+    #: Its budget in words.
+    budget: str
+    #: The seed.
+    seed: int
+    #: PSNR, macro mean, dB.
+    psnr: float
+    #: How far it was checked, one of `records.LEVELS`.
+    level: str
+    #: Why it is not the row, in a few words.
+    why: str
+
+
+@dataclass(frozen=True)
+class Row:
+    """One measured row: a method with one budget on one suite, over its seeds."""
+
+    #: Name of its first entry, which stands for the row.
+    name: str
+    #: What the board calls the method.
+    title: str
+    #: Its suite.
+    suite: str
+    #: Its budget in words.
+    budget: str
+    #: Device that the method says it ran on.
+    device: str
+    #: Names of its entries by seed, the lowest first.
+    seeds: Mapping[int, str]
+    #: Day of the latest evaluation, ISO 8601.
+    date: str
+    #: Scores by scope and metric, means over seeds; None where the suite has no such capture.
+    #: `motion_blur@3` is the scope of captures whose motion blur is of severity 3.
+    scores: Mapping[str, Mapping[str, float | None]]
+    #: Mean seconds of a fit.
+    fit: float | None
+    #: Frames that failed, over all seeds.
+    failed: int
+    #: How far all of it was checked, one of `records.LEVELS`.
+    level: str
+    #: Its reproducibility badge, one of `records.BADGES`.
+    badge: str
+    #: What the method had on the suite before, the newest first.
+    older: Sequence[OlderRun] = ()
+
+
+def make_row(row: BoardRow, label: str = "", older: Sequence[Entry] = ()) -> Row:
+    """Return a row as the page shows it.
+
+    Args:
+        row: the row.
+        label: what the board calls the method; empty takes its title.
+        older: other entries of the method on the suite.
+    """
+    found = [_scopes(entry) for entry in row.entries]
+    captures = [capture for entry in row.entries for capture in entry.results.captures]
+    return Row(
+        name=row.entries[0].name,
+        title=label or row.first.method.title,
+        suite=row.first.suite,
+        budget=budget_text(row.first.budget),
+        device=", ".join(sorted({one.device for one in captures if one.device})) or "not said",
+        seeds={entry.results.seed: entry.name for entry in row.entries},
+        date=max(entry.results.started for entry in row.entries)[:10],
+        scores={
+            scope: {name: _mean([one[scope].get(name) for one in found]) for name in METRICS}
+            for scope in found[0]
+        },
+        fit=row.fit_seconds,
+        failed=sum(capture.failed_frames for capture in captures),
+        level=row.level,
+        badge=row.badge,
+        older=[_older_run(entry, row, older) for entry in older],
+    )
+
+
+def _older_run(entry: Entry, row: BoardRow, older: Sequence[Entry]) -> OlderRun:
+    known = [*row.entries, *older]
+    corrections = [e for e in known if e.submission.revises == entry.name and takes_over(e, entry)]
+    if corrections:
+        why = f"replaced: {corrections[0].submission.reason}"
+    elif LEVELS.index(entry.level) < LEVELS.index(row.level):
+        why = "checked less far than the row"
+    elif find_missing(entry.results):
+        why = "lacks a part of the suite"
+    else:
+        why = "older than the row"
+    results = entry.results
+    return OlderRun(
+        name=entry.name,
+        date=results.started[:10],
+        budget=budget_text(results.budget),
+        seed=results.seed,
+        psnr=results.scores["psnr"],
+        level=entry.level,
+        why=why,
+    )
+
+
+def _scopes(entry: Entry) -> dict[str, Mapping[str, float]]:
+    """Means of the metrics of an entry by scope; an empty one where it has no such capture."""
+    captures = score_rows(entry.results)
+    found = _means(captures)
+    severities = suite_severities(entry.results.suite)
+    for level in SEVERITIES:
+        if chosen := at_severity(captures, severities, level):
+            found |= {f"{scope}@{level}": means for scope, means in _means(chosen).items() if means}
+    return found
+
+
+def _means(captures: Sequence[CaptureScores]) -> dict[str, Mapping[str, float]]:
+    mean = aggregate(captures)
+    return {
+        **{scope: {} for scope in SCOPES},
+        "macro": mean.overall.macro,
+        "single": mean.single.capture_mean if mean.single else {},
+        "interacting": mean.interacting.capture_mean if mean.interacting else {},
+        **mean.overall.perturbations,
+    }
+
+
+def severities_of(rows: Sequence[Row]) -> list[int]:
+    """Return the severities that captures of the rows have, rising."""
+    scopes = {scope for row in rows for scope in row.scores}
+    return [level for level in SEVERITIES if f"macro@{level}" in scopes]
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if known else None
+
+
+def budget_text(budget: Mapping[str, Any]) -> str:
+    """Return a budget in words: `60 s`, `500 steps`, `60 s, 500 steps` or `no limit`."""
+    units = {"seconds": "s", "steps": "steps"}
+    parts = [f"{budget[name]:g} {unit}" for name, unit in units.items() if budget.get(name)]
+    return ", ".join(parts) or "no limit"
+
+
+def rankable(rows: Sequence[BoardRow]) -> tuple[list[BoardRow], str]:
+    """Choose the rows that can be ranked with each other.
+
+    Ranks come from differences by pairs over the seeds that two rows share. Left out are
+
+    - rows that lack a part of their suite;
+    - all rows but one of the same run: the one that was checked furthest stays, then the first by
+      name;
+    - rows without a seed that others have: rows with the seed that most rows have stay (of several
+      the smallest), and of the others those that share a seed with every row that stays.
+
+    Args:
+        rows: of one suite and one version of the protocol.
+
+    Returns:
+        Those that stay, in the order given, and a sentence that names the whole rows that do not;
+        empty where there are none.
+    """
+    whole = [row for row in rows if row.whole]
+    if not whole:
+        return [], ""
+    single = _one_of_each_run(whole)
+    common = _most_common_seed(single)
+    stay = [row for row in single if common in row.seeds]
+    for row in single:
+        if row not in stay and all(set(row.seeds) & set(other.seeds) for other in stay):
+            stay.append(row)
+    parts = []
+    twins = _names([row for row in whole if row not in single])
+    if twins:
+        parts.append(f"No rank for a second entry of the same run: {twins}.")
+    apart = _names([row for row in single if row not in stay])
+    if apart:
+        parts.append(
+            f"No rank for rows without the seed {common}, which most rows have, and without a "
+            f"seed in common with every other row: {apart}."
+        )
+    return [row for row in rows if row in stay], " ".join(parts)
+
+
+def _one_of_each_run(rows: Sequence[BoardRow]) -> list[BoardRow]:
+    """Leave out rows that have a run (a state of a method and a seed) of a row before them."""
+    order = sorted(rows, key=lambda row: (-LEVELS.index(row.level), row.entries[0].name))
+    seen: set[tuple[str, int]] = set()
+    kept = []
+    for row in order:
+        runs = {(same_but_seed(row.first), seed) for seed in row.seeds}
+        if not runs & seen:
+            kept.append(row)
+            seen |= runs
+    return [row for row in rows if row in kept]
+
+
+def _most_common_seed(rows: Sequence[BoardRow]) -> int:
+    seeds = sorted({seed for row in rows for seed in row.seeds})
+    return max(seeds, key=lambda seed: sum(seed in row.seeds for row in rows))
+
+
+def _names(rows: Sequence[BoardRow]) -> str:
+    return ", ".join(row.entries[0].name for row in rows)
+
+
+def board_tables(entries: Sequence[Entry]) -> list[Table]:
+    """Return a table for each suite and protocol, best row first.
+
+    Each method has one row, of its newest entries that were checked furthest; its older ones are
+    left out. A row that lacks a part of its suite is shown without a rank.
+
+    Args:
+        entries: entries that `rules.check_entries` has passed.
+    """
+    found = tables_of(entries)
+    return [_table(suite, protocol, rows) for (suite, protocol), rows in found.items()]
+
+
+def _table(suite: str, protocol: str, entries: Sequence[Entry]) -> Table:
+    methods = method_rows(entries)
+    rows = [method.row for method in methods]
+    ranks, sentence = ranks_of(methods)
+    titles = {method.row.entries[0].name: method.label for method in methods}
+    order = sorted(
+        rows,
+        key=lambda row: (
+            not row.whole,
+            ranks[row.entries[0].name].rank if row.entries[0].name in ranks else len(rows),
+            -row.scores[METRIC],
+            row.entries[0].name,
+        ),
+    )
+    columns = (
+        Column("Method"),
+        Column("Rank", 0, group="Rank"),
+        Column("95 %", group="Rank"),
+        *(score_column(name) for name in HEADLINE),
+        Column("Fit [s]", 1),
+        Column("Seeds", 0),
+        Column("Level"),
+        Column("Badge"),
+        Column("Entry"),
+    )
+    cells: list[tuple[Cell, ...]] = []
+    for row in order:
+        first = row.entries[0].name
+        rank = ranks.get(first)
+        cells.append(
+            (
+                titles[first],
+                rank.rank if rank else None,
+                rank_interval(rank) if rank else None,
+                *(row.scores[name] for name in HEADLINE),
+                row.fit_seconds,
+                len(row.seeds),
+                row.level,
+                row.badge,
+                first if len(row.seeds) == 1 else f"{first} and {len(row.seeds) - 1} more",
+            )
+        )
+    notes = [sentence] if sentence else []
+    lacking = frozenset(place for place, row in enumerate(order) if not row.whole)
+    if lacking:
+        notes.append("Rows that lack captures or test frames of the suite have no rank.")
+    if protocol != HWP_V1.name:
+        notes.append(f"Scored by {protocol}; rows of {HWP_V1.name} stand in another table.")
+    if older := sum(len(method.older) for method in methods):
+        notes.append(f"{older} older or less checked entries of these methods are not shown.")
+    return Table(
+        f"Suite {suite}, protocol {protocol}",
+        columns,
+        tuple(cells),
+        tuple(notes),
+        unranked=lacking,
+    )
+
+
+def _called(results: Results, label: str) -> Results:
+    return replace(results, method=replace(results.method, title=label))
+
+
+def rank_interval(rank: Rank) -> str:
+    """Return the ranks that the data allow in words: `1`, or `1 to 3`."""
+    return f"{rank.best}" if rank.best == rank.worst else f"{rank.best} to {rank.worst}"
+
+
+def ranks_of(methods: Sequence[MethodRow]) -> tuple[dict[str, Rank], str]:
+    """Return ranks by the name of a row's first entry, and the sentence that says who wins.
+
+    Args:
+        methods: of one suite and one version of the protocol. Those that `rankable` leaves out get
+            no rank, and the sentence names them.
+    """
+    ranked, left_out = rankable([method.row for method in methods])
+    if not ranked:
+        return {}, ""
+    labels = {method.row.entries[0].name: method.label for method in methods}
+    compared = {
+        row.entries[0].name: [_called(one, labels[row.entries[0].name]) for one in row.compared]
+        for row in ranked
+    }
+    runs = group_runs([one for results in compared.values() for one in results])
+    ranking = rank_methods(runs, METRIC)
+    by_label = {item.standing.label: item for item in ranking.ranks}
+    found = {
+        name: by_label[run.label]
+        for name, (first, *_) in compared.items()
+        for run in runs
+        if any(first is results for results in run.seeds.values())
+    }
+    return found, f"{verdict(ranking)} {left_out}".rstrip()
+
+
+#: The method that every other one is measured against.
+REFERENCE = "wildghand"
+
+
+def reference_lead(rows: Sequence[BoardRow]) -> str:
+    """Return one sentence: the reference against the best competitor with the same budget.
+
+    Where the reference has rows of several budgets, the one with most competitors speaks.
+
+    Args:
+        rows: of one suite and one version of the protocol; those that lack a part of the suite do
+            not take part.
+
+    Returns:
+        The sentence, whatever it says; empty where nobody has the budget of the reference, or no
+        seed in common with it.
+    """
+    whole = [row for row in rows if row.whole]
+    mine = [row for row in whole if row.first.method.name == REFERENCE]
+    others = [row for row in whole if row.first.method.name != REFERENCE]
+    pairs = [(row, [other for other in others if _equal_budget(row, other)]) for row in mine]
+    reference, competitors = max(
+        pairs, key=lambda pair: (len(pair[1]), pair[0].scores[METRIC]), default=(None, [])
+    )
+    if reference is None or not competitors:
+        return ""
+    best = max(competitors, key=lambda row: row.scores[METRIC])
+    results = [one for row in (reference, best) for one in row.compared]
+    try:
+        (found,) = compare(group_runs(results), METRIC, scope=MACRO)
+    except UsageError:
+        return ""
+    lead = found.estimate
+    facts = metric_facts(METRIC)
+    where = "ahead of" if lead.value >= 0.0 else "behind"
+    text = (
+        f"{reference.first.method.title} is {abs(lead.value):.{facts.digits}f} {facts.unit} "
+        f"{where} {best.first.method.title}, the best other method "
+        f"with the same budget on {reference.first.suite}"
+    )
+    if lead.low is None or lead.high is None:
+        return f"{text}; nothing says how sure that is."
+    text += f" (95 % interval {lead.low:+.{facts.digits}f} to {lead.high:+.{facts.digits}f}"
+    return text + ("; not significant)." if lead.low <= 0.0 <= lead.high else ").")
+
+
+def _equal_budget(one: BoardRow, other: BoardRow) -> bool:
+    return one.first.budget == other.first.budget
+
+
+@dataclass(frozen=True)
+class CurvePlot:
+    """One plot with what its legend needs."""
+
+    #: The plot, an SVG element.
+    figure: Markup
+    #: Labels of the methods, in the order of their colours.
+    methods: Sequence[str]
+    #: Labels of those that are on the Pareto front for some time.
+    front: Sequence[str]
+
+
+def curve_plot(rows: Sequence[BoardRow]) -> CurvePlot | None:
+    """Draw the mean score of validation frames over the seconds of fitting, and the front.
+
+    Args:
+        rows: of one suite and one version of the protocol; those that lack a part of the suite do
+            not take part.
+
+    Returns:
+        The plot, best row first in its legend; None where no row left a curve, or where one
+        submitted twice cannot be told apart.
+    """
+    whole = sorted((row for row in rows if row.whole), key=lambda row: -row.scores[METRIC])
+    try:
+        runs = group_runs([results for row in whole for results in row.compared])
+        cost = analyse_cost(runs, METRIC) if runs else None
+    except UsageError:
+        return None
+    if cost is None:
+        return None
+    order = {curve.label: index for index, curve in enumerate(cost.curves)}
+    figure = draw_pareto(cost.curves, cost.front, METRIC, order)
+    suite = whole[0].first.suite
+    title = f"{metric_facts(METRIC).label} over seconds of fitting on {suite}"
+    leading = {part.label for part in cost.front}
+    return CurvePlot(
+        inline_svg(figure, title), list(order), [label for label in order if label in leading]
+    )

@@ -1,0 +1,419 @@
+"""Tables that look at predictions again: by novelty of the pixels, and by what is drawn outside."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from statistics import fmean
+
+import cv2
+import numpy as np
+
+from hwp_bench.base.console import track
+from hwp_bench.base.errors import UsageError
+from hwp_bench.base.images import read_rgb
+from hwp_bench.base.tables import Cell, Column, Table
+from hwp_bench.capture import Capture
+from hwp_bench.capture.splits import Split, split_for
+from hwp_bench.hands.anchors import Footprint, HandSurfaces
+from hwp_bench.metrics.pixels import (
+    check_prediction,
+    check_truth,
+    composite,
+    decibels,
+    hand_pixels,
+    scored_pixels,
+    squared_error,
+)
+from hwp_bench.metrics.protocol import HWP_V1
+from hwp_bench.report.sources import ResultsSource, stored_predictions
+from hwp_bench.report.tables import labels
+from hwp_bench.results import CaptureResult
+
+#: Edge of a cell, m.
+PATCH = 0.004
+# Training frames that are compared at a time.
+_CHUNK = 64
+
+
+@dataclass(frozen=True, eq=False)
+class Novelty:
+    """The novelty of one test frame, (H, W) each; NaN where the posed hand is not drawn."""
+
+    #: Index of the frame.
+    frame: int
+    #: Angle between the normal and the nearest normal of the same place in a training frame,
+    #: degrees; 180 where no training frame shows the place.
+    angle: np.ndarray
+    #: Share of the training frames that show the place, 0 to 1.
+    seen: np.ndarray
+
+
+def measure_novelty(capture: Capture, split: Split, frames: Sequence[int]) -> Iterator[Novelty]:
+    """Compare test frames with the training frames.
+
+    Hands are where the truth has them, or the estimates where the capture knows no truth. A
+    training frame shows a place where its given mask has a pixel of it.
+
+    Args:
+        capture: the capture.
+        split: says which frames train.
+        frames: indices of the frames to compare.
+
+    Raises:
+        BadInput: the hand template that is installed is not the capture's.
+    """
+    surfaces = HandSurfaces({side: capture.template(side) for side in capture.info.sides}, PATCH)
+    hands = capture.true_hands or capture.hands
+    valid = np.all([hand.valid for hand in hands.values()], axis=0)
+    train = split.train[valid[split.train]]
+    count = len(surfaces.cell_normals)
+    normals = np.zeros((len(train), count, 3), dtype=np.float32)
+    for row, footprint in enumerate(_footprints(surfaces, capture, train)):
+        shown = hand_pixels(capture.mask(int(train[row]))).reshape(-1)[footprint.pixels]
+        normals[row] = _mean_normals(footprint.cells[shown], footprint.normals[shown], count)
+    known = (normals != 0.0).any(axis=2)
+    share = known.mean(axis=0) if len(train) else np.zeros(count)
+    test = np.array(frames, dtype=np.int64)
+    for frame, footprint in zip(frames, _footprints(surfaces, capture, test), strict=True):
+        cells = np.unique(footprint.cells)
+        mine = _mean_normals(footprint.cells, footprint.normals, count)[cells]
+        nearest = np.full(len(cells), -1.0)
+        for start in range(0, len(train), _CHUNK):
+            part = slice(start, start + _CHUNK)
+            cosines = np.einsum("fck,ck->fc", normals[part][:, cells], mine)
+            cosines[~known[part][:, cells]] = -1.0
+            nearest = np.maximum(nearest, cosines.max(axis=0))
+        place = np.searchsorted(cells, footprint.cells)
+        angle, seen = (np.full(capture.size, np.nan) for _ in range(2))
+        degrees = np.degrees(np.arccos(np.clip(nearest, -1.0, 1.0)))
+        angle.reshape(-1)[footprint.pixels] = degrees[place]
+        seen.reshape(-1)[footprint.pixels] = share[footprint.cells]
+        yield Novelty(frame, angle, seen)
+
+
+def _footprints(
+    surfaces: HandSurfaces, capture: Capture, frames: np.ndarray
+) -> Iterator[Footprint]:
+    cameras = capture.cameras
+    return surfaces.footprints(
+        capture.true_hands or capture.hands, cameras.Ks, cameras.viewmats, frames, capture.size
+    )
+
+
+def _mean_normals(cells: np.ndarray, normals: np.ndarray, count: int) -> np.ndarray:
+    """(C, 3) float32 unit mean normal of each cell; zeros where no pixel shows it."""
+    sums = np.stack([np.bincount(cells, normals[:, k], count) for k in range(3)], axis=1)
+    length = np.linalg.norm(sums, axis=1, keepdims=True)
+    unit: np.ndarray = np.where(length > 1e-6, sums / np.maximum(length, 1e-6), 0.0)
+    return unit.astype(np.float32)
+
+
+#: A pixel of a prediction shows something if a channel is above this; methods draw over black.
+LIT = 12
+#: Where a mask does not know each pixel's coverage, its outline is uncertain by this much, px.
+UNCERTAIN = 2
+# A pixel with those around it. The outermost pixels of a drawing mix its colours with black.
+_RIM = np.ones((3, 3), np.uint8)
+
+
+@dataclass(frozen=True)
+class OutlineScores:
+    """One frame, by what its prediction draws outside of the hand."""
+
+    #: PSNR of the headline protocol, dB.
+    psnr: float
+    #: Lit pixels that the hand does not touch, as a share of the scored pixels.
+    drawn_outside: float
+    #: The same error and that of all pixels that the hand does not touch, which should be black,
+    #: over the number of scored pixels, dB.
+    psnr_with_outside: float
+    #: The headline's PSNR if every pixel outside of the drawn hand took the nearest colour of it,
+    #: dB.
+    psnr_spread: float
+
+
+def outline_scores(
+    prediction: np.ndarray, target: np.ndarray, mask: np.ndarray, *, coverage: bool = False
+) -> OutlineScores | None:
+    """Score a frame with and without what lies outside of the hand.
+
+    Args:
+        prediction: (H, W, 3) uint8 sRGB over black.
+        target: (H, W, 3) uint8.
+        mask: (H, W) uint8 or bool, the data set's own visible-hand mask.
+        coverage: True where `mask` holds the share of each pixel that the hand covers.
+
+    Returns:
+        The scores; None where no pixel is scored.
+
+    Raises:
+        BadImage, BadPrediction, ShapeMismatch: as `score_frame`.
+    """
+    check_truth(target, mask)
+    check_prediction(prediction, target)
+    region = scored_pixels(mask, erosion=HWP_V1.mask_erosion, coverage=coverage)
+    count = int(np.count_nonzero(region))
+    if not count:
+        return None
+    outside = _untouched(mask, coverage=coverage)
+    lit = prediction.max(axis=2) > LIT
+    black = composite(target, ~outside)
+    error = squared_error(prediction, black)
+    spread = squared_error(spread_outwards(prediction, lit), black)
+
+    def score(errors: np.ndarray, pixels: np.ndarray) -> float:
+        return decibels(float(errors[pixels].sum()) / (count * 255.0**2))
+
+    return OutlineScores(
+        psnr=score(error, region),
+        drawn_outside=float(np.count_nonzero(lit & outside)) / count,
+        psnr_with_outside=score(error, region | outside),
+        psnr_spread=score(spread, region),
+    )
+
+
+def spread_outwards(prediction: np.ndarray, lit: np.ndarray) -> np.ndarray:
+    """Give every pixel outside of a drawn hand, and its rim, the nearest colour within.
+
+    Args:
+        prediction: (H, W, 3) uint8.
+        lit: (H, W) bool, where something is drawn.
+
+    Returns:
+        Like the prediction; the prediction itself where nothing is drawn but a rim.
+    """
+    from scipy.ndimage import distance_transform_edt
+
+    within = cv2.erode(lit.astype(np.uint8), _RIM, borderValue=1) > 0
+    if not within.any():
+        return prediction
+    rows, columns = distance_transform_edt(~within, return_distances=False, return_indices=True)
+    return np.asarray(prediction[rows, columns])
+
+
+def _untouched(mask: np.ndarray, *, coverage: bool) -> np.ndarray:
+    """(H, W) bool: pixels of which the hand covers nothing."""
+    if coverage and mask.dtype != np.bool_:
+        return mask == 0
+    near = cv2.dilate(hand_pixels(mask).astype(np.uint8), _RIM, iterations=UNCERTAIN)
+    return near == 0
+
+
+#: Upper ends of the classes of angles, degrees; the last class was never seen.
+ANGLES = (5.0, 10.0, 20.0, 40.0, 180.0)
+#: Upper ends of the classes of how often a place was seen, shares of the training frames.
+SHARES = (0.05, 0.2, 0.5, 1.0)
+_ANGLE_NAMES = ("below 5°", "5° to 10°", "10° to 20°", "20° to 40°", "above 40°", "never seen")
+_SHARE_NAMES = ("never", "in 5 % or less", "in 5 to 20 %", "in 20 to 50 %", "in more than 50 %")
+_OFF = "off the posed hand"
+#: Rows of the table: what is new, and how much.
+CLASSES = (
+    *(("Angle to the nearest training normal", name) for name in (*_ANGLE_NAMES, _OFF)),
+    *(("Place seen in training frames", name) for name in (*_SHARE_NAMES, _OFF)),
+)
+
+
+def novelty_table(sources: Sequence[ResultsSource], captures: Mapping[str, Capture]) -> Table:
+    """Return one row a class of novelty and method: share of the pixels and of the error, PSNR.
+
+    Errors are pooled over the scored pixels of all frames of all captures. Frames without a
+    sound prediction are left out.
+
+    Args:
+        sources: evaluations with their predictions.
+        captures: by digest.
+
+    Raises:
+        UsageError: no capture or no prediction is at hand, or a split is not the usual one.
+    """
+    totals = _pooled(sources, captures)
+    if not any(pixels.any() for pixels, _ in totals):
+        raise UsageError(
+            "none of these captures, or none of the predictions, is at hand",
+            field="--captures",
+            remedy="Name the capture folders, and results folders that hold predictions.",
+        )
+    columns = (
+        Column("What is new"),
+        Column("Class"),
+        Column("Method"),
+        Column("Pixels [%]", 1),
+        Column("Of the error [%]", 1),
+        Column("PSNR [dB]", 2, True),
+    )
+    half = len(_ANGLE_NAMES) + 1
+    rows: list[tuple[Cell, ...]] = []
+    breaks = []
+    titles = labels([source.results for source in sources])
+    for index, (what, name) in enumerate(CLASSES):
+        block = slice(0, half) if index < half else slice(half, None)
+        breaks.append(len(rows))
+        for title, (pixels, errors) in zip(titles, totals, strict=True):
+            if not pixels[index]:
+                continue
+            rows.append(
+                (
+                    what,
+                    name,
+                    title,
+                    float(100.0 * pixels[index] / pixels[block].sum()),
+                    float(100.0 * errors[index] / max(errors[block].sum(), 1e-12)),
+                    decibels(errors[index] / pixels[index]),
+                )
+            )
+    notes = (
+        "Classes of the scored pixels of all test frames; the squared error is pooled in each.",
+        "Angle: between a pixel's normal and the nearest normal of the same 4 mm place in a "
+        "training frame. Seen: share of the training frames whose mask shows the place.",
+    )
+    inner = tuple(place for place in dict.fromkeys(breaks) if 0 < place < len(rows))
+    return Table("By novelty", columns, tuple(rows), notes, breaks=inner)
+
+
+def _pooled(
+    sources: Sequence[ResultsSource], captures: Mapping[str, Capture]
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Scored pixels, and their squared error, of each of `CLASSES`, for each evaluation.
+
+    Novelty is the captures' own, so that each of them is measured once for all methods.
+    """
+    totals = [(np.zeros(len(CLASSES)), np.zeros(len(CLASSES))) for _ in sources]
+    for digest, capture in track(captures.items(), "Novelty", len(captures)):
+        split = split_for(capture.info.id, len(capture))
+        runs = []
+        for source, total in zip(sources, totals, strict=True):
+            for item in source.on(digest):
+                _check_split(item, split)
+                runs.append((stored_predictions(source, item), total))
+        frames = sorted({frame for files, _ in runs for frame in files})
+        if not frames:
+            continue
+        for novelty in measure_novelty(capture, split, frames):
+            mask, exact = capture.scoring_mask(novelty.frame)
+            region = scored_pixels(mask, erosion=HWP_V1.mask_erosion, coverage=exact)
+            target = capture.frame(novelty.frame) / 255.0
+            classes = classes_of(novelty, region)
+            for files, (pixels, errors) in runs:
+                if novelty.frame not in files:
+                    continue
+                prediction = read_rgb(files[novelty.frame], capture.size) / 255.0
+                error = squared_error(prediction, target)[region]
+                for index in classes:
+                    np.add.at(pixels, index, 1.0)
+                    np.add.at(errors, index, error)
+    return totals
+
+
+def _check_split(item: CaptureResult, split: Split) -> None:
+    """Refuse a split whose training frames are not known here."""
+    if split.digest != item.split_digest:
+        raise UsageError(
+            "was not split by the 80/10/10 rule; novelty needs its training frames",
+            where=item.id,
+            field="RESULTS",
+        )
+
+
+def classes_of(novelty: Novelty, region: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Positions in `CLASSES` of the pixels of a region, (P,) by angle and (P,) by share.
+
+    Args:
+        novelty: of the frame.
+        region: (H, W) bool, P pixels.
+    """
+    angle, seen = novelty.angle[region], novelty.seen[region]
+    off = np.isnan(angle)
+    by_angle = np.searchsorted(ANGLES[:-1], np.nan_to_num(angle), side="right")
+    by_angle[seen == 0.0] = len(_ANGLE_NAMES) - 1
+    by_angle[off] = len(_ANGLE_NAMES)
+    start = len(_ANGLE_NAMES) + 1
+    by_share = 1 + np.searchsorted(SHARES, np.nan_to_num(seen), side="left")
+    by_share[seen == 0.0] = 0
+    by_share[off] = len(_SHARE_NAMES)
+    return by_angle, start + by_share
+
+
+_NOTES = (
+    "Means over captures of the means over test frames. Outside are pixels that the hand does not "
+    "touch; lit ones of them, as a share of the scored pixels, are drawn outside.",
+    "With the outside: the error of these pixels, which should be black, is added. If spread: the "
+    "headline's PSNR if the drawn hand went on outwards in its nearest colours.",
+    "A hand behind a sleeve or an object counts as drawn outside, for every method alike.",
+)
+
+
+def outline_table(sources: Sequence[ResultsSource], captures: Mapping[str, Capture]) -> Table:
+    """Return one row a method: PSNR, what is drawn outside, and PSNR with it and with more of it.
+
+    Frames without a sound prediction are left out, and captures that are not at hand for every
+    method.
+
+    Args:
+        sources: evaluations with their predictions.
+        captures: by digest.
+
+    Raises:
+        UsageError: no capture, or not every method's predictions of it, is at hand.
+    """
+    found: list[list[OutlineScores]] = [[] for _ in sources]
+    for digest, capture in track(captures.items(), "Outlines", len(captures)):
+        means = _means(sources, digest, capture)
+        if means:
+            for scores, mean in zip(found, means, strict=True):
+                scores.append(mean)
+    if not found or not found[0]:
+        raise UsageError(
+            "none of these captures is at hand with the predictions of every method",
+            field="--captures",
+            remedy="Name the capture folders, and results folders that hold predictions.",
+        )
+    columns = (
+        Column("Method"),
+        Column("PSNR [dB]", 2, True),
+        Column("Drawn outside [%]", 1, False),
+        Column("With the outside [dB]", 2, True),
+        Column("If spread [dB]", 2),
+    )
+    rows: list[tuple[Cell, ...]] = []
+    titles = labels([source.results for source in sources])
+    for title, scores in zip(titles, found, strict=True):
+        mean = _mean(scores)
+        outside = 100.0 * mean.drawn_outside
+        rows.append((title, mean.psnr, outside, mean.psnr_with_outside, mean.psnr_spread))
+    return Table("By outline", columns, tuple(rows), _NOTES)
+
+
+def _means(sources: Sequence[ResultsSource], digest: str, capture: Capture) -> list[OutlineScores]:
+    """Each method's means over the test frames of a capture; empty where one has none to score."""
+    runs = [
+        {
+            frame: path
+            for item in source.on(digest)
+            for frame, path in stored_predictions(source, item).items()
+        }
+        for source in sources
+    ]
+    if not all(runs):
+        return []
+    scores: list[list[OutlineScores]] = [[] for _ in sources]
+    # Each frame is read once for all methods.
+    for frame in sorted({frame for files in runs for frame in files}):
+        target, (mask, exact) = capture.frame(frame), capture.scoring_mask(frame)
+        for files, mine in zip(runs, scores, strict=True):
+            if frame not in files:
+                continue
+            prediction = read_rgb(files[frame], capture.size)
+            one = outline_scores(prediction, target, mask, coverage=exact)
+            if one is not None:
+                mine.append(one)
+    return [_mean(mine) for mine in scores] if all(scores) else []
+
+
+def _mean(scores: Sequence[OutlineScores]) -> OutlineScores:
+    return OutlineScores(
+        psnr=fmean(one.psnr for one in scores),
+        drawn_outside=fmean(one.drawn_outside for one in scores),
+        psnr_with_outside=fmean(one.psnr_with_outside for one in scores),
+        psnr_spread=fmean(one.psnr_spread for one in scores),
+    )
