@@ -1,4 +1,4 @@
-"""Roughness with a gradient by hand; oracle: `SurfaceLaplacian.roughness` in float64; 1e-5."""
+"""Roughness of raw attributes; oracle: the same of the parts in float64; 1e-5."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def test_value_and_gradient(frames: int, scales: float, colors: float) -> None:
     rig = make_rig(load_template("anny", "right"), 300)
     random = torch.Generator().manual_seed(0)
     raw = torch.randn(frames, 300, 14, generator=random).requires_grad_()
-    value = attribute_roughness(surface_laplacian(rig), raw, scales, colors)
+    value = attribute_roughness(surface_laplacian(rig), RawAttributes.split(raw), scales, colors)
     (gradient,) = torch.autograd.grad(3.0 * value, raw)
     exact, true = surface_laplacian(rig, dtype=torch.float64), raw.detach().double()
     parts = RawAttributes.split(true.requires_grad_())
