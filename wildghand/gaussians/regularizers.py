@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor, relu, stack
-from torch.nn.functional import normalize
 
 from hwp_bench.base.errors import ShapeMismatch
 from hwp_bench.base.numerics import kd_tree
@@ -159,9 +158,8 @@ def attribute_roughness(
     laplacian: SurfaceLaplacian, raw: RawAttributes, scales: float, colors: float
 ) -> Tensor:
     """Weighted roughness of the raw log scales and of the sigmoid of the raw colours."""
-    return scales * laplacian.roughness(raw.log_scales) + colors * laplacian.roughness(
-        raw.logit_colors.sigmoid()
-    )
+    parts = math.sqrt(scales) * raw.log_scales, math.sqrt(colors) * raw.logit_colors.sigmoid()
+    return laplacian.roughness(torch.cat(parts, dim=-1))
 
 
 # What costs nothing. Lengths in spacings of the anchors: how far a Gaussian reaches off the skin
@@ -184,8 +182,8 @@ def off_surface(
         raw: (B, N, k) attributes.
         spacing: mean distance between neighbouring anchors, m.
     """
-    rows = _rotation_rows(raw.quats)
     drawn = activation(raw)
+    rows = _rotation_rows(drawn.quats)
     squares = (drawn.scales / spacing).square()
     xx, yy, xy = ((squares * rows[i] * rows[j]).sum(dim=-1) for i, j in ((0, 0), (1, 1), (0, 1)))
     across = xx + yy
@@ -204,8 +202,8 @@ def off_surface(
 
 
 def _rotation_rows(quats: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The rows (..., 3) of a Gaussian's rotation, of which two lie in the skin."""
-    w, x, y, z = normalize(quats, dim=-1).unbind(-1)
+    """The rows (..., 3) of a unit quaternion's rotation, of which two lie in the skin."""
+    w, x, y, z = quats.unbind(-1)
     first = (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y))
     second = (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x))
     third = (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y))
