@@ -20,8 +20,7 @@ import torch
 from numba import types
 
 from hwp_bench.base.errors import ShapeMismatch
-from hwp_bench.base.kernels import compiled
-from wildghand.splat.kernels.jit import inline, next_job
+from wildghand.splat.kernels.jit import inline, jobs, kernel
 from wildghand.splat.kernels.vectors import (
     Vector,
     absolute,
@@ -75,7 +74,7 @@ class Made(NamedTuple):
     factors: np.ndarray  # (3, B, H, W * C) float32; blurred, they make the gradient of SSIM
 
 
-@compiled(nogil=True)
+@kernel
 def find_content(worker, counters, ends, x, y, channels, content):
     """The part of each image outside of which both images are zero; a job is an image.
 
@@ -84,10 +83,7 @@ def find_content(worker, counters, ends, x, y, channels, content):
     """
     height, size = x.shape[1:]
     seen = np.empty(size, np.bool_)
-    while True:
-        image = next_job(worker, counters, ends)
-        if image < 0:
-            break
+    for image in jobs(worker, counters, ends):
         seen[:] = False
         top, bottom = height, 0
         for row in range(height):
@@ -195,7 +191,7 @@ def _compare_row(images, at, first, last, channels, constants, blurred, spread, 
         store(made.factors, 2 * plane + at + j, scale * (a1 * inverse) * (-_TWO))
 
 
-@compiled(nogil=True)
+@kernel
 def compare(worker, counters, ends, images, channels, constants, made):
     """Errors of every row, and what their gradient is made of; a job is a row of an image.
 
@@ -208,10 +204,7 @@ def compare(worker, counters, ends, images, channels, constants, made):
     spread, errors = np.empty(size, np.float32), np.empty(size, np.float32)
     # What rounding leaves of a pixel that is black in both.
     black = (_ONE - c1 * c2 * (_ONE / (c1 * c2))) * lambda_ * np.float32(channels)
-    while True:
-        job = next_job(worker, counters, ends)
-        if job < 0:
-            break
+    for job in jobs(worker, counters, ends):
         image, row = job // height, job % height
         weights, line = images.weights[image, row], made.errors[image, row]
         top, bottom, first, last = _grown(images.content, image, height, size, channels, _HALF)
@@ -237,7 +230,7 @@ def compare(worker, counters, ends, images, channels, constants, made):
         made.sums[image, row] = found
 
 
-@compiled(nogil=True)
+@kernel
 def gather(worker, counters, ends, images, channels, window, made, gradient):
     """The gradient by x. The window is symmetric and the border zero: it is its own adjoint.
 
@@ -248,10 +241,7 @@ def gather(worker, counters, ends, images, channels, window, made, gradient):
     pad = 2 * _HALF * channels
     blurred = np.empty((3, size + 2 * pad), np.float32)
     stride, plane = blurred.shape[1], made.direct.size
-    while True:
-        job = next_job(worker, counters, ends)
-        if job < 0:
-            break
+    for job in jobs(worker, counters, ends):
         image, row = job // height, job % height
         gradient[image, row] = _ZERO
         top, bottom, first, last = _grown(images.content, image, height, size, channels, _HALF)
@@ -333,13 +323,13 @@ class PhotometricCpu(torch.autograd.Function):
             channels,
             images.content,
         )
-        jobs = even_jobs(
+        shares = even_jobs(
             count * height, thread_count(count * height, x.size // _VALUES_LIKE_A_PAIR)
         )
-        run(compare, jobs, images, channels, constants, made)
+        run(compare, shares, images, channels, constants, made)
         if ctx.needs_input_grad[0]:
             gradient = np.empty_like(x)
-            run(gather, jobs, images, channels, constants.window, made, gradient.reshape(rows))
+            run(gather, shares, images, channels, constants.window, made, gradient.reshape(rows))
             ctx.gradient = gradient
         ctx.save_for_backward(torch.from_numpy(made.errors))
         ctx.count = x.size

@@ -19,11 +19,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hwp_bench.base.kernels import compiled, helper
+from hwp_bench.base.kernels import helper
 from hwp_bench.hands import HandTemplate, TemplateTensors, pose_hand
 from hwp_bench.hands.anchors import SurfaceAnchors, anchor_frames, anchor_positions, sample_surface
 from wildghand.gaussians.quaternions import matrix_to_quat
-from wildghand.splat.kernels.jit import next_job
+from wildghand.splat.kernels.jit import jobs, kernel
 from wildghand.splat.threads import kernels_take, run_pieces
 
 #: Anchors that one thread places at a time.
@@ -51,7 +51,7 @@ def _factors(squared):
     return a, b, (math.cos(angle) - a) / (2.0 * squared), (0.5 * a - b) / squared
 
 
-@compiled(nogil=True)
+@kernel
 def chain(pose, rest, rotations, turns, shifts):
     """Forward kinematics of one frame.
 
@@ -99,7 +99,7 @@ def chain(pose, rest, rotations, turns, shifts):
             shifts[j, row] = shift
 
 
-@compiled(nogil=True)
+@kernel
 def chain_backward(pose, rest, rotations, turns, of_turns, of_shifts, of_rotations):
     """Gradients of `chain`, from those of turns and shifts.
 
@@ -159,7 +159,7 @@ def _rodrigues_backward(vector, g, out):
         out[row] = a * cross[row] + b * both + 2.0 * v[row] * (a_slope * of_a + b_slope * of_b)
 
 
-@compiled(nogil=True)
+@kernel
 def skin(rest, joint_of, weight_of, turns, shifts, vertices):
     """Linear blend skinning of one frame.
 
@@ -186,7 +186,7 @@ def skin(rest, joint_of, weight_of, turns, shifts, vertices):
         vertices[v, 0], vertices[v, 1], vertices[v, 2] = a, b, c
 
 
-@compiled(nogil=True)
+@kernel
 def skin_backward(of_points, corners, mix, rest, joint_of, weight_of, turns, of_rest):
     """Gradients of the skinning, from those of the anchors' positions in one frame.
 
@@ -234,7 +234,7 @@ def skin_backward(of_points, corners, mix, rest, joint_of, weight_of, turns, of_
     return of_turns, of_shifts
 
 
-@compiled(nogil=True)
+@kernel
 def vertex_normals(vertices, faces, normals):
     """Unit normals (V, 3), faces weighed by area; (0, 0, 1) where there is no face of any area."""
     normals[:] = np.float32(0.0)
@@ -270,7 +270,7 @@ def _unit(x, y, z):
     return np.float32(0.0), np.float32(0.0), np.float32(1.0)
 
 
-@compiled(nogil=True)
+@kernel
 def place_anchors(
     worker, counters, ends, vertices, normals, transl, corners, first_edge, mix, positions,
     orientations,
@@ -283,8 +283,7 @@ def place_anchors(
         positions: (N, 3) float32, filled, m.
         orientations: (N, 4) float32, filled: unit quaternions (w, x, y, z).
     """
-    job = next_job(worker, counters, ends)
-    while job >= 0:
+    for job in jobs(worker, counters, ends):
         for n in range(PIECE * job, min(PIECE * (job + 1), len(corners))):
             px = py = pz = nx = ny = nz = np.float32(0.0)
             for corner in range(3):
@@ -312,7 +311,6 @@ def place_anchors(
             tx, ty, tz = _unit(ex, ey, ez)
             bx, by, bz = ny * tz - nz * ty, nz * tx - nx * tz, nx * ty - ny * tx
             _quaternion(tx, ty, tz, bx, by, bz, nx, ny, nz, orientations[n])
-        job = next_job(worker, counters, ends)
 
 
 @helper
