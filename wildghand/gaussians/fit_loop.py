@@ -9,7 +9,7 @@ import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -112,8 +112,6 @@ MAX_RISE = 3.0
 
 #: The loss of a step: a number, or a scalar on a device, which nobody has waited for yet.
 Loss = float | torch.Tensor
-Snapshot = TypeVar("Snapshot", covariant=True)
-Kept = TypeVar("Kept")
 
 
 def _warm_up() -> None:
@@ -209,19 +207,7 @@ def read_losses(losses: Sequence[Loss]) -> list[float]:
     return [next(numbers) if isinstance(loss, torch.Tensor) else loss for loss in losses]
 
 
-class Fitted(Protocol[Snapshot]):
-    """A model that is being fitted."""
-
-    def finite(self) -> bool:
-        """Whether every fitted number is finite."""
-        ...
-
-    def snapshot(self) -> Snapshot:
-        """A copy of the state that the fit no longer changes."""
-        ...
-
-
-class Guard(Generic[Kept]):
+class Guard:
     """Watches the loss of a fit.
 
     Attributes:
@@ -231,11 +217,13 @@ class Guard(Generic[Kept]):
     def __init__(self) -> None:
         self.step = 0
         self._best_loss = math.inf
-        self._best: Kept | None = None
+        self._best: Any = None
         self._losses: list[Loss] = []
 
-    def watch(self, step: int, loss: Loss, model: Fitted[Kept]) -> bool:
-        """Take note of the loss of `model` after `step` steps; False means divergence.
+    def watch(self, step: int, loss: Loss, model: Any) -> bool:
+        """Take note of the loss after `step` steps; False means divergence.
+
+        The `model` says whether it is `finite`, and gives a `snapshot` of its state.
 
         A loss that is on a device is looked at when its window ends. The steps until then are not
         kept if it turns out not to be finite.
@@ -258,7 +246,7 @@ class Guard(Generic[Kept]):
         """Whether the losses since the last window are finite; to be asked when a fit ends."""
         return all(math.isfinite(loss) for loss in read_losses(self._losses))
 
-    def best(self) -> Kept:
+    def best(self) -> Any:
         """The state with the lowest loss; `DidNotConverge` if there was none."""
         if self._best is None:
             raise DidNotConverge(

@@ -114,7 +114,7 @@ class Watchers:
     """
 
     def __init__(self, plateau_steps: int) -> None:
-        self.guard: Guard[dict[str, torch.Tensor]] = Guard()
+        self.guard = Guard()
         self.plateau = Plateau(plateau_steps)
 
     def state_dict(self) -> dict[str, Any]:

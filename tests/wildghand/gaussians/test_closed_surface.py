@@ -111,13 +111,6 @@ def test_float32_is_exact_enough(flatness: float) -> None:
     assert float((exact.grad != 0.0).double().mean()) > 0.4
 
 
-def test_it_takes_no_frames() -> None:
-    raw = torch.randn(40, 14, generator=torch.Generator().manual_seed(1))
-    alone = off_surface(RawAttributes.split(raw), Activation(), SPACING)
-    frame = off_surface(RawAttributes.split(raw[None]), Activation(), SPACING)
-    assert torch.equal(alone, frame)
-
-
 def test_nothing_but_the_term_closes_a_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     """A hand of which no frame shows anything: scattered and clear Gaussians close."""
     settings = read_settings({"gaussians": 4000, "prior": "", "light.enabled": False})
