@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.stats import spearmanr
 
 from hwp_bench.base.console import track
 from hwp_bench.base.drawing import labelled, sheet
@@ -142,6 +143,28 @@ def explain_frames(
             pictures.append(image.clamp(0.0, 1.0).numpy())
         seen = capture.frame(frame) / 255.0 * (capture.mask(frame)[..., None] / 255.0)
         found.append(Explanation(frame, float(omegas[row]), seen, *pictures))
+    return found
+
+
+@torch.no_grad()
+def temporal_weights(
+    avatar: WildGHandAvatar, capture: Capture
+) -> dict[str, tuple[float, float | None]]:
+    """The mean size of omega by hand, and its rank correlation with the frames' severity.
+
+    Severity is the sum of the levels of all perturbations. The correlation (Spearman's) is None
+    where a level is not known, or where all frames have the same severity or weight.
+    """
+    frames, found = avatar.record.frames, {}
+    levels = [[*capture.info.severity(frame).values()] for frame in frames]
+    known = all(level is not None for each in levels for level in each)
+    severity = [sum(level or 0 for level in each) for each in levels]
+    for side in avatar.model.perturbation:
+        temporal = avatar.model.biases_of(side).temporal(torch.arange(len(frames)))
+        sizes, rank = temporal.omega.abs().numpy(), None
+        if known and len(set(severity)) > 1 and len(set(sizes.tolist())) > 1:
+            rank = float(spearmanr(sizes, severity).statistic)
+        found[side] = float(sizes.mean()), rank
     return found
 
 

@@ -144,7 +144,7 @@ def _capture(args: argparse.Namespace, world: World) -> int:
     from hwp_bench.base.errors import UsageError
     from hwp_bench.methods.contract import Budget
     from wildghand.fitting.session import fit_capture
-    from wildghand.from_video.job import with_quick
+    from wildghand.from_video.run import with_quick
 
     for option in ("side", "landmarks", "model", "hand-model"):
         if getattr(args, option.replace("-", "_")) is not None:

@@ -43,9 +43,7 @@ def _bent(hands: dict[str, HandParameters]) -> dict[str, HandParameters]:
 @pytest.fixture
 def believing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fits believe in bent fingers."""
-    monkeypatch.setattr(
-        start, "believed_hands", lambda templates, hands, cameras, settings: _bent(hands)
-    )
+    monkeypatch.setattr(start, "believed_hands", lambda templates, hands, cameras: _bent(hands))
 
 
 def _fitted(training: TrainingCapture, **changes: object) -> WildGHandAvatar:
