@@ -16,7 +16,7 @@ from hwp_bench.base.arrays import evenly
 from hwp_bench.base.console import track
 from hwp_bench.base.errors import HwpError
 from hwp_bench.base.files import atomic_write, check_places
-from hwp_bench.sim.effects import hands_at, registered
+from hwp_bench.sim.effects import EFFECTS, hands_at
 from hwp_bench.sim.geometry.noise import generator
 from hwp_bench.sim.geometry.rays import RenderCost
 from hwp_bench.sim.light.lights import Lamp, Light, Room, focus_point
@@ -311,7 +311,7 @@ def _with_estimate(scene: Scene, call: EffectCall, result: SimulatedFrame) -> Si
     from hwp_bench.hands import pose_hand, project
 
     seconds = result.plan.seconds
-    angle, length = registered(call.kind).estimate_error(result.plan.strength[call.kind])
+    angle, length = EFFECTS[call.kind].estimate_error(result.plan.strength[call.kind])
     rng = generator(scene.seed, "gallery")
     image = result.rgb.copy()
     for side, moment in hands_at(scene, seconds).items():

@@ -183,6 +183,15 @@ def transformed(surface: Surface, transform: np.ndarray) -> Surface:
     )
 
 
+def rigid(turn: np.ndarray | None, place: np.ndarray | tuple[float, float, float]) -> np.ndarray:
+    """(4, 4) rigid motion of a rotation (3, 3), if any, and then a way (3,) m."""
+    move = np.eye(4)
+    if turn is not None:
+        move[:3, :3] = turn
+    move[:3, 3] = place
+    return move
+
+
 def plain(color: tuple[float, float, float] | np.ndarray, **settings: float) -> Material:
     """A material of one linear colour."""
     albedo = np.asarray(color, dtype=np.float32).reshape(1, 1, 3)
@@ -201,9 +210,7 @@ def picture_material(image: np.ndarray, gloss: float) -> Material:
 
 def shift(surface: Surface, place: tuple[float, float, float] | np.ndarray) -> Surface:
     """A surface moved by (3,) m."""
-    move = np.eye(4)
-    move[:3, 3] = place
-    return transformed(surface, move)
+    return transformed(surface, rigid(None, place))
 
 
 _Channel = Annotated[float, Meta(ge=0.0, le=1.0)]

@@ -21,7 +21,7 @@ from hwp_bench.base.colors import linear_to_srgb
 from hwp_bench.base.console import track
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.files import atomic_write
-from hwp_bench.sim.effects import hands_at, plan_frame, registered
+from hwp_bench.sim.effects import EFFECTS, hands_at, plan_frame
 from hwp_bench.sim.geometry.noise import generator
 from hwp_bench.sim.geometry.rays import RenderCost
 from hwp_bench.sim.light.lights import steady_light
@@ -69,7 +69,7 @@ class Calibration:
 def calibrate(scene: Scene, call: EffectCall, size: int = SIZE) -> Calibration:
     """Solve an effect's strengths for the stated losses."""
     covering = call.kind == "hand_object_interaction"
-    top = registered(call.kind).max_strength
+    top = EFFECTS[call.kind].max_strength
     tried = top * (_TRIED_LINEAR if covering else _TRIED)
     frames = _frames(scene, call)
     measure = _measure(scene, call, frames, size)
@@ -147,7 +147,7 @@ def _pose_loss(scene: Scene, frame: int, size: int, strength: float) -> float:
     stage = Stage(scene, cost)
     seconds = plan_frame(scene, frame, scene.frame_count, size).seconds
     hands = hands_at(scene, seconds)
-    angle, length = registered("complex_poses").estimate_error(strength)
+    angle, length = EFFECTS["complex_poses"].estimate_error(strength)
     rng = generator(scene.seed, "calibration", frame)
     wrong = {}
     for side, (pose, transl) in stage.parameters(hands).items():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hwp_bench.hands.skeleton import HandParameters
-from hwp_bench.sim.effects import FramePlan, registered
+from hwp_bench.sim.effects import EFFECTS, FramePlan
 from hwp_bench.sim.geometry.noise import fractal_noise, generator
 from hwp_bench.sim.produce.tracker import tracked
 from hwp_bench.sim.props.backdrops import plane_names
@@ -189,7 +189,7 @@ def estimate_mask(
 def _errors(plan: FramePlan) -> tuple[float, float]:
     angle, length = (error**2 for error in EASY_ERROR)
     for kind, strength in plan.strength.items():
-        more = registered(kind).estimate_error(strength)
+        more = EFFECTS[kind].estimate_error(strength)
         angle += more[0] ** 2
         length += more[1] ** 2
     return float(np.sqrt(angle)), float(np.sqrt(length))
