@@ -22,8 +22,7 @@ from hwp_bench.hands import HandTemplate
 from hwp_bench.hands.skeleton import JOINT_COUNT
 from hwp_bench.sim.effects import hands_at
 from hwp_bench.sim.light.lights import focus_point
-from hwp_bench.sim.scene.motion import HandMoment, hand_parameters, scene_hands
-from hwp_bench.sim.scene.scene import Scene
+from hwp_bench.sim.scene.scene import HandMoment, Scene, hand_parameters, scene_hands
 from hwp_bench.sim.subject.hand import MOVING, SubjectHand
 
 #: Way along the skin, m, below which two places of a hand are neighbours.

@@ -18,14 +18,24 @@ from hwp_bench.base.errors import HwpError
 from hwp_bench.base.files import atomic_write, check_places
 from hwp_bench.sim.effects import EFFECTS, hands_at
 from hwp_bench.sim.geometry.noise import generator
-from hwp_bench.sim.geometry.rays import RenderCost
+from hwp_bench.sim.geometry.surface import RenderCost
 from hwp_bench.sim.light.lights import Lamp, Light, Room, focus_point
 from hwp_bench.sim.produce.free_view import FRAMES, free_views, render_free
 from hwp_bench.sim.produce.preview import captioned, strip
 from hwp_bench.sim.props.behind import Behind, Clutter, Face, OtherArm
 from hwp_bench.sim.render.frame import SimulatedFrame, render_frame, steady_gain
-from hwp_bench.sim.scene.motion import hand_parameters, intrinsics, scene_hands, viewmat
-from hwp_bench.sim.scene.scene import EffectCall, HandKey, Scene, Track, with_effects, with_severity
+from hwp_bench.sim.scene.scene import (
+    EffectCall,
+    HandKey,
+    Scene,
+    Track,
+    hand_parameters,
+    intrinsics,
+    scene_hands,
+    viewmat,
+    with_effects,
+    with_severity,
+)
 from hwp_bench.sim.scene_files import load_scene, scene_names
 from hwp_bench.sim.sensor import AutoControl, Sensor, check_encoder, through_h264
 from hwp_bench.sim.subject.subject import Looks

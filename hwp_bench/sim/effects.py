@@ -22,9 +22,14 @@ from hwp_bench.sim.geometry.noise import generator
 from hwp_bench.sim.geometry.surface import rigid, unit
 from hwp_bench.sim.light.lights import CastShadow, Lights, focus_point, steady_light
 from hwp_bench.sim.props.objects import check_object
-from hwp_bench.sim.scene.motion import (
+from hwp_bench.sim.scene.scene import (
+    EffectCall,
+    Episode,
+    HandKey,
     HandMoment,
+    Scene,
     along_keys,
+    by_side,
     envelope,
     intrinsics,
     level,
@@ -33,7 +38,6 @@ from hwp_bench.sim.scene.motion import (
     severity,
     track_moment,
 )
-from hwp_bench.sim.scene.scene import EffectCall, Episode, HandKey, Scene, by_side
 from hwp_bench.sim.sensor import sensor_passes
 from hwp_bench.sim.subject.subject import Words
 

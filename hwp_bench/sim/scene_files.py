@@ -13,9 +13,15 @@ from msgspec import Meta
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.records import MAX_CHARACTERS, parse_record, parse_toml
 from hwp_bench.sim.effects import check_hands, read_effect
-from hwp_bench.sim.props.backdrops import check_backdrop
-from hwp_bench.sim.scene.motion import clean_share
-from hwp_bench.sim.scene.scene import CLEAN_FROM, MIN_CLEAN_SHARE, EffectCall, Episode, Scene
+from hwp_bench.sim.props.behind import check_backdrop
+from hwp_bench.sim.scene.scene import (
+    CLEAN_FROM,
+    MIN_CLEAN_SHARE,
+    EffectCall,
+    Episode,
+    Scene,
+    clean_share,
+)
 from hwp_bench.sim.sensor import Sensor
 from hwp_bench.sim.subject.subject import Words
 from hwp_bench.taxonomy import MAX_SEVERITY, PERTURBATIONS

@@ -25,7 +25,7 @@ from painted import (
 from hwp_bench.hands import pose_hand
 from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.methods.contract import Budget
-from hwp_bench.sim.geometry.rays import Tracer
+from hwp_bench.sim.geometry.surface import Tracer
 from plain_fit.method import PlainMethod
 from shadow_albedo_fit.method import ShadowMethod
 from shadow_albedo_fit.model import ShadowedModel, lamp_cameras, visibility

@@ -1,15 +1,19 @@
-"""Surfaces that rays can hit: mesh arithmetic, materials, and building blocks of things."""
+"""Surfaces that rays can hit: mesh arithmetic, materials, building blocks of things, and rays."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+import time
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from msgspec import Meta
 
 from hwp_bench.base.colors import srgb_to_linear
+from hwp_bench.base.rays import ray_mesh
 from hwp_bench.hands.template import boundary_vertices
 
 if TYPE_CHECKING:
@@ -337,3 +341,63 @@ def ink(color: Color) -> tuple[int, int, int]:
 def albedo(image: np.ndarray) -> np.ndarray:
     """Linear reflectance of a painted (H, W, 3) uint8 image: float32."""
     return srgb_to_linear(image / 255.0).astype(np.float32)
+
+
+#: Distance by which secondary rays leave their surface, m; below it a hand shades itself.
+LIFT = 4e-4
+
+
+@dataclass(frozen=True)
+class Hits:
+    """The points where rays meet a mesh."""
+
+    #: (H,) index of the ray.
+    ray: np.ndarray
+    #: (H,) face that was hit first.
+    face: np.ndarray
+    #: (H, 3) barycentric weights of the face's corners.
+    weights: np.ndarray
+    #: (H,) distance in lengths of the ray's direction.
+    distance: np.ndarray
+
+
+class Tracer:
+    """One mesh, ready to be asked what rays meet.
+
+    Takes `vertices` (V, 3) m, `faces` (F, 3) vertex indices.
+    """
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray, rays: Counter[str]) -> None:
+        self._mesh = ray_mesh(vertices, faces)
+        self._rays = rays
+
+    def first_hits(self, origins: np.ndarray, directions: np.ndarray, purpose: str) -> Hits:
+        """Find the first face on every ray.
+
+        Takes `origins` (N, 3) m, `directions` (N, 3).
+        """
+        self._rays[purpose] += len(directions)
+        ray, face, u, v, distance = self._mesh.first_hits(origins, directions)
+        return Hits(ray, face, np.stack([1.0 - u - v, u, v], axis=1), distance)
+
+    def blocked(self, origins: np.ndarray, directions: np.ndarray, purpose: str) -> np.ndarray:
+        """Tell for every ray whether anything is in its way: (N,) bool."""
+        self._rays[purpose] += len(directions)
+        return self._mesh.blocked(origins, directions)
+
+
+@dataclass
+class RenderCost:
+    """Cost of rendering: seconds by pass, rays by purpose."""
+
+    #: Processor seconds by pass; other work on the machine does not count.
+    seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))
+    #: Rays by purpose.
+    rays: Counter[str] = field(default_factory=Counter)
+
+    @contextmanager
+    def time(self, name: str) -> Iterator[None]:
+        """Charge what happens inside to one pass."""
+        start = time.process_time()
+        yield
+        self.seconds[name] += time.process_time() - start

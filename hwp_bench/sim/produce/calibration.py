@@ -23,13 +23,11 @@ from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.files import atomic_write
 from hwp_bench.sim.effects import EFFECTS, hands_at, plan_frame
 from hwp_bench.sim.geometry.noise import generator
-from hwp_bench.sim.geometry.rays import RenderCost
+from hwp_bench.sim.geometry.surface import RenderCost
 from hwp_bench.sim.light.lights import steady_light
 from hwp_bench.sim.render.frame import carry_out
-from hwp_bench.sim.render.instant import Lens, render_instant
-from hwp_bench.sim.render.stage import Stage
-from hwp_bench.sim.scene.motion import intrinsics, viewmat
-from hwp_bench.sim.scene.scene import EffectCall, Scene, with_effects
+from hwp_bench.sim.render.stage import Lens, Stage, render_instant
+from hwp_bench.sim.scene.scene import EffectCall, Scene, intrinsics, viewmat, with_effects
 from hwp_bench.sim.scene_files import parse_scene
 from hwp_bench.sim.sensor import Sensor
 from hwp_bench.sim.subject.hand import MOVING

@@ -1,7 +1,7 @@
-"""From a scene to a capture folder: frames in parallel, resumable, the same on any machine.
+"""From a scene to a capture folder, and from a suite to captures in the cache.
 
-Frames wait in one file each until their capture is whole; a render that was interrupted goes on
-where it stopped.
+Frames are rendered in parallel, the same on any machine. They wait in one file each until their
+capture is whole; a render that was interrupted goes on where it stopped.
 """
 
 from __future__ import annotations
@@ -17,13 +17,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
 from hwp_bench.base.arrays import read_npz
 from hwp_bench.base.console import progress
 from hwp_bench.base.errors import BadInput, HwpError, UsageError, place, reason_of, whole_number
-from hwp_bench.base.files import atomic_write, canonical_json, sha256_json
+from hwp_bench.base.files import atomic_write, cache_root, canonical_json, sha256_json
 from hwp_bench.base.folders import exclusive
 from hwp_bench.capture import (
     Cameras,
@@ -35,7 +36,7 @@ from hwp_bench.capture import (
 )
 from hwp_bench.capture.schema import FREE_VIEW, SIMULATED
 from hwp_bench.hands.skeleton import HandParameters
-from hwp_bench.run.engine import Job, Needs
+from hwp_bench.run.engine import Engine, Job, LocalEngine, Needs
 from hwp_bench.run.engine.job import OnProgress
 from hwp_bench.run.engine.processes import THREADS, LocalJob, Stopped, WorkerLost, run_in_process
 from hwp_bench.sim.effects import FramePlan, hands_at, plan_frame
@@ -44,12 +45,10 @@ from hwp_bench.sim.produce.estimates import confused_mask, estimate_hands, estim
 from hwp_bench.sim.produce.free_view import add_free_view, has_free_view, write_free_view
 from hwp_bench.sim.produce.truth import distances, write_truth
 from hwp_bench.sim.render.frame import eight_bit_coverage, render_frame, write_layers
-from hwp_bench.sim.scene.motion import intrinsics, parameters_of, scene_hands, viewmat
-from hwp_bench.sim.scene.scene import Scene
-from hwp_bench.sim.scene_files import load_scene
+from hwp_bench.sim.scene.scene import Scene, intrinsics, parameters_of, scene_hands, viewmat
+from hwp_bench.sim.scene_files import load_scene, scene_groups, scene_names
 from hwp_bench.sim.sensor import check_encoder, through_h264
-from hwp_bench.sim.subject.atlas import skin_atlas
-from hwp_bench.sim.subject.skin import of_side
+from hwp_bench.sim.subject.hand import of_side, skin_atlas
 
 #: Version of the pixels that the renderer makes; part of every render key.
 RENDERER = 10
@@ -475,3 +474,139 @@ def _info(scene: Scene, plans: list[FramePlan], size: int) -> CaptureInfo:
         },
         licence=LICENCE,
     )
+
+
+@dataclass(frozen=True)
+class SuiteItem:
+    """One capture of a suite."""
+
+    #: The scene.
+    scene: Scene
+    #: Frames over which it is spread.
+    frame_count: int
+    #: Edge of the image in pixels.
+    size: int
+
+
+# One single-hand and one interacting capture for each perturbation: interaction 0 and 5,
+# complex poses 1 and 6, illumination 2 and 7, motion blur 3 and 4.
+_MINI = tuple(f"capture{number}" for number in range(8))
+
+
+@dataclass(frozen=True)
+class _Rule:
+    """How a suite is made of scenes."""
+
+    #: Edge of the image, px.
+    size: int
+    #: Frames of each capture, over the same motions; None: by the paper's number and `every`.
+    frames: int | None = None
+    #: The captures; None: all of the group of scenes with the suite's name, or the eleven.
+    captures: tuple[str, ...] | None = None
+    #: Without `frames`: how many of the paper's frames stand for one of the suite's.
+    every: int = 1
+
+
+_SUITES: Mapping[str, _Rule] = MappingProxyType(
+    {
+        "smoke": _Rule(112, 30, ("capture0", "capture4")),
+        "mini": _Rule(176, 60, _MINI),
+        "full-lite": _Rule(256, every=12),
+        "full": _Rule(256),
+        "wild-dev": _Rule(176, 60),
+        "wild-test": _Rule(176, 60),
+    }
+)
+
+
+def suite_names() -> tuple[str, ...]:
+    """Names of the suites: those of the paper's captures, smallest first, then the wild ones."""
+    return tuple(_SUITES)
+
+
+def suite(name: str) -> tuple[SuiteItem, ...]:
+    """Return the captures of a suite.
+
+    Args:
+        name: `smoke` (seconds), `mini` (minutes), `full` (hours), `full-lite` (a twelfth
+            of its frames), or of scenes that are as wide as the world: `wild-dev` (for tuning)
+            or `wild-test` (for reports only).
+
+    Raises:
+        UsageError: there is no such suite.
+    """
+    if name not in _SUITES:
+        raise UsageError(f"there is no suite {name!r}", remedy=f"Known: {', '.join(_SUITES)}.")
+    rule = _SUITES[name]
+    group = name if name in scene_groups() else ""
+    scenes = [load_scene(capture) for capture in rule.captures or scene_names(group)]
+    return tuple(
+        SuiteItem(scene, rule.frames or -(-scene.frame_count // rule.every), rule.size)
+        for scene in scenes
+    )
+
+
+def ensure_suite(
+    name: str | Sequence[SuiteItem],
+    cache: str | os.PathLike[str] | None = None,
+    workers: int | None = None,
+    *,
+    engine: Engine | None = None,
+    needs: Needs | None = None,
+    free_view: bool = True,
+) -> list[Path]:
+    """Render the captures of a suite that are not in the cache yet.
+
+    Args:
+        name: a suite, or captures such as some of one.
+        cache: folder of captures; the toolkit's cache if None.
+        workers: processes for each render.
+        engine: where captures are rendered; one after another in this process if None.
+        needs: what one render takes of a machine.
+        free_view: also render free-view clips, which captures in the cache may lack.
+
+    Returns:
+        The capture folders, in the suite's order.
+
+    Raises:
+        UsageError: there is no such suite.
+        HwpError: a render failed; captures that were finished stay.
+    """
+    engine, needs = engine or LocalEngine(), needs or Needs()
+    items = suite(name) if isinstance(name, str) else name
+    each = workers_each(workers, engine, needs)
+    jobs = [
+        RenderRequest(
+            item.scene, item.frame_count, item.size, workers=each, keep=True, free_view=free_view
+        ).job(_folder(item, cache), needs)
+        for item in items
+    ]
+    if not all(job.finished() for job in jobs):
+        engine.run(jobs, lambda index: None)
+    return [job.output for job in jobs]
+
+
+def is_rendered(name: str, cache: str | os.PathLike[str] | None = None) -> bool:
+    """Whether every capture of a suite is in the cache, with its free-view clip."""
+    return all(
+        RenderRequest(item.scene, item.frame_count, item.size, keep=True).is_whole(
+            _folder(item, cache)
+        )
+        for item in suite(name)
+    )
+
+
+def _folder(item: SuiteItem, cache: str | os.PathLike[str] | None) -> Path:
+    """Where a capture lies in the cache."""
+    root = Path(cache) if cache is not None else cache_root() / "sim" / "captures"
+    key = render_key(item.scene, item.frame_count, item.size)
+    return root / f"{item.scene.id}-{item.frame_count}x{item.size}-{key[:12]}"
+
+
+def workers_each(workers: int | None, engine: Engine, needs: Needs) -> int | None:
+    """Return the processes of one render: as asked for, else as many as the engine allows.
+
+    In turn each render takes as many as are worth it; where several run at once, the processors
+    of a job.
+    """
+    return workers if workers is not None or engine.in_turn else max(1, int(needs.cpus))

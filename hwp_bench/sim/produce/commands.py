@@ -21,8 +21,8 @@ def list_scenes(args: argparse.Namespace) -> int:
     """Print the scenes, and what scenes can be made of."""
     from hwp_bench.hands.poses import gestures
     from hwp_bench.sim.effects import ORDER
-    from hwp_bench.sim.produce.suites import suite, suite_names
-    from hwp_bench.sim.props.backdrops import backdrop_names
+    from hwp_bench.sim.produce.capture import suite, suite_names
+    from hwp_bench.sim.props.behind import backdrop_names
     from hwp_bench.sim.props.objects import object_names
 
     scenes = [load_scene(name) for name in known_scenes()]
@@ -86,7 +86,7 @@ def print_plan(args: argparse.Namespace) -> int:
 def render(args: argparse.Namespace) -> int:
     """Render captures and print their folders."""
     from hwp_bench.run.engine.options import engine_for, needs_of
-    from hwp_bench.sim.produce.suites import ensure_suite
+    from hwp_bench.sim.produce.capture import ensure_suite
 
     if (args.suite is None) == (args.scene is None):
         raise UsageError("give a scene, all, or a suite with --suite")
@@ -127,8 +127,7 @@ def render(args: argparse.Namespace) -> int:
 
 def _render_scenes(args: argparse.Namespace, scenes: list[Scene], engine: Engine) -> list[Path]:
     from hwp_bench.run.engine.options import needs_of
-    from hwp_bench.sim.produce.capture import RenderRequest
-    from hwp_bench.sim.produce.suites import workers_each
+    from hwp_bench.sim.produce.capture import RenderRequest, workers_each
 
     needs = needs_of(args)
     jobs = []

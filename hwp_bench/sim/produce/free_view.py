@@ -23,12 +23,12 @@ from hwp_bench.capture.schema import FREE_VIEW, MAX_ID
 from hwp_bench.hands.poses import gestures, within_limits
 from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.sim.geometry.noise import generator
-from hwp_bench.sim.geometry.rays import RenderCost
-from hwp_bench.sim.geometry.surface import unit
+from hwp_bench.sim.geometry.surface import RenderCost, unit
 from hwp_bench.sim.light.lights import FOCUS_DISTANCE, focus_point
 from hwp_bench.sim.render.frame import eight_bit_coverage, render_view, steady_gain
-from hwp_bench.sim.scene.motion import (
+from hwp_bench.sim.scene.scene import (
     HandMoment,
+    Scene,
     hand_parameters,
     heading_matrix,
     intrinsics,
@@ -36,7 +36,6 @@ from hwp_bench.sim.scene.motion import (
     scene_hands,
     track_moment,
 )
-from hwp_bench.sim.scene.scene import Scene
 from hwp_bench.sim.subject.hand import template_vertices
 
 #: Frames of a clip.

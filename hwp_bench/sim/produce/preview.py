@@ -13,13 +13,11 @@ from hwp_bench.base.errors import MissingDependency, UsageError
 from hwp_bench.base.files import atomic_write
 from hwp_bench.base.images import write_image
 from hwp_bench.sim.effects import hands_at, lights_at, objects_at, plan_frame
-from hwp_bench.sim.geometry.rays import RenderCost
-from hwp_bench.sim.geometry.surface import Surface
+from hwp_bench.sim.geometry.surface import RenderCost, Surface
 from hwp_bench.sim.light.lights import focus_point
 from hwp_bench.sim.render.frame import SimulatedFrame, render_frame
 from hwp_bench.sim.render.stage import Stage
-from hwp_bench.sim.scene.motion import viewmat
-from hwp_bench.sim.scene.scene import Scene
+from hwp_bench.sim.scene.scene import Scene, viewmat
 from hwp_bench.sim.subject.hand import MOVING
 from hwp_bench.taxonomy import perturbation
 

@@ -16,8 +16,7 @@ from hwp_bench.base.tables import Cell, Column, Table
 from hwp_bench.capture import Capture
 from hwp_bench.capture.schema import EXTRA, SIMULATED, TRUE_TEMPLATE, write_subject_mesh
 from hwp_bench.hands.template import HandTemplate, rebuilt
-from hwp_bench.sim.scene.motion import palm_of, scene_hands
-from hwp_bench.sim.scene.scene import Scene
+from hwp_bench.sim.scene.scene import Scene, palm_of, scene_hands
 from hwp_bench.sim.subject.hand import SubjectHand, is_off_template, subject_hand
 from hwp_bench.sim.subject.subject import Subject
 

@@ -15,7 +15,7 @@ from msgspec import Meta
 from hwp_bench.base.errors import ODD_CHARACTERS, UsageError
 from hwp_bench.base.records import Seed, number
 from hwp_bench.sim.geometry.surface import Color
-from hwp_bench.sim.hand.off_template import SubjectAnatomy
+from hwp_bench.sim.hand.anatomy import SubjectAnatomy
 from hwp_bench.sim.subject.wear import Glove, Polish, Ring, Tattoo, WristWear
 
 

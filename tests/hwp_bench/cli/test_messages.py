@@ -73,7 +73,7 @@ def test_a_subject_is_painted_without_a_cache(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from hwp_bench.sim.scene_files import load_scene
-    from hwp_bench.sim.subject.atlas import SkinAtlas, kept
+    from hwp_bench.sim.subject.hand import SkinAtlas, kept
 
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("HWP_CACHE", str(tmp_path / "file" / "cache"))

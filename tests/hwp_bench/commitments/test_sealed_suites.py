@@ -22,7 +22,7 @@ from hwp_bench.commitments.publication import joint_commitment
 from hwp_bench.commitments.recipe import derived, read_secret, recipe_of, sealed_items
 from hwp_bench.methods.request import open_request
 from hwp_bench.sim.render import stage
-from hwp_bench.sim.subject import atlas
+from hwp_bench.sim.subject import hand as atlas
 
 RECIPE = recipe_of(["capture2"], 10, 40)
 NAME = "sealed-capture2"

@@ -11,7 +11,7 @@ from hwp_bench.sim.render import stage as person
 from hwp_bench.sim.scene.scene import Scene
 from hwp_bench.sim.scene_files import parse_scene
 from hwp_bench.sim.subject import arms as forearm
-from hwp_bench.sim.subject import atlas
+from hwp_bench.sim.subject import hand as atlas
 
 
 @pytest.fixture

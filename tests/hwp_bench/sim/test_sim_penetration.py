@@ -20,8 +20,7 @@ from benchmarks.penetration import (
     self_penetration,
 )
 from hwp_bench.hands.poses import gestures
-from hwp_bench.sim.scene.motion import moment_of_key, scene_hands
-from hwp_bench.sim.scene.scene import HandKey
+from hwp_bench.sim.scene.scene import HandKey, moment_of_key, scene_hands
 from hwp_bench.sim.scene_files import load_scene, scene_names
 from hwp_bench.sim.subject.hand import MOVING, SubjectHand
 

@@ -17,13 +17,10 @@ from tiny_scene import BLUR, CLEAN, LIGHT, OBJECT
 
 from hwp_bench.base.errors import BadInput
 from hwp_bench.sim.effects import ORDER, plan_frame
-from hwp_bench.sim.geometry.rays import RenderCost, Tracer
-from hwp_bench.sim.geometry.surface import Surface
+from hwp_bench.sim.geometry.surface import RenderCost, Surface, Tracer
 from hwp_bench.sim.light.lights import steady_light
-from hwp_bench.sim.render.exposure import knots, row_by_row
-from hwp_bench.sim.render.frame import SimulatedFrame, render_frame
-from hwp_bench.sim.render.instant import Lens, render_instant
-from hwp_bench.sim.render.stage import Body
+from hwp_bench.sim.render.frame import SimulatedFrame, knots, render_frame, row_by_row
+from hwp_bench.sim.render.stage import Body, Lens, render_instant
 from hwp_bench.sim.scene.scene import Scene
 from hwp_bench.sim.sensor import Sensor
 from hwp_bench.taxonomy import PERTURBATIONS

@@ -20,13 +20,12 @@ from benchmarks.subjects import ANATOMIES, SHOWN
 from hwp_bench.base.errors import BadInput
 from hwp_bench.hands import HandTemplate, load_template
 from hwp_bench.hands.skeleton import PARENTS
-from hwp_bench.sim.hand.off_template import SubjectAnatomy, off_template, resized, reweighted
-from hwp_bench.sim.hand.rig_mesh import outlines
+from hwp_bench.sim.hand.anatomy import SubjectAnatomy, off_template, resized, reweighted
+from hwp_bench.sim.hand.rigs import outlines
 from hwp_bench.sim.light.lights import focus_point
 from hwp_bench.sim.produce.capture import render_capture
 from hwp_bench.sim.produce.truth import distances, subject_table, template_distance
-from hwp_bench.sim.scene.motion import hand_parameters, moment_of_key
-from hwp_bench.sim.scene.scene import HandKey, Scene
+from hwp_bench.sim.scene.scene import HandKey, Scene, hand_parameters, moment_of_key
 from hwp_bench.sim.scene_files import load_scene
 from hwp_bench.sim.subject.hand import (
     MOVING,

@@ -26,8 +26,14 @@ from benchmarks.rig_files import (
 from hwp_bench.base.errors import BadHandModel
 from hwp_bench.hands import HandTemplate, load_template
 from hwp_bench.hands.template import boundary_loop
-from hwp_bench.sim.hand.rig_mesh import FARTHEST_BEFORE, FARTHEST_BEHIND, components, outlines
-from hwp_bench.sim.hand.rigs import hand_joints, load_rig
+from hwp_bench.sim.hand.rigs import (
+    FARTHEST_BEFORE,
+    FARTHEST_BEHIND,
+    components,
+    hand_joints,
+    load_rig,
+    outlines,
+)
 from hwp_bench.sim.render.frame import render_frame
 from hwp_bench.sim.scene.scene import Scene
 

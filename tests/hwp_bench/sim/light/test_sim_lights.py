@@ -17,8 +17,7 @@ from tiny_scene import BLUR, CLEAN, LIGHT, OBJECT
 
 from hwp_bench.base.errors import BadInput
 from hwp_bench.sim.effects import lights_at, plan_frame
-from hwp_bench.sim.geometry.rays import LIFT, RenderCost, Tracer
-from hwp_bench.sim.geometry.surface import Surface, plain
+from hwp_bench.sim.geometry.surface import LIFT, RenderCost, Surface, Tracer, plain
 from hwp_bench.sim.light.lights import (
     BORDER_SHARE,
     FACING_SHARE,
@@ -31,8 +30,7 @@ from hwp_bench.sim.light.lights import (
     wall_irradiance,
     wall_radiance,
 )
-from hwp_bench.sim.light.samples import Samples
-from hwp_bench.sim.light.shading import GRIDS, SKIN_REACH, lamp_light, room_light
+from hwp_bench.sim.light.shading import GRIDS, SKIN_REACH, Samples, lamp_light, room_light
 from hwp_bench.sim.render.frame import render_frame
 from hwp_bench.sim.scene.scene import Scene
 from hwp_bench.sim.sensor import AutoControl, Sensor

@@ -17,20 +17,26 @@ from hwp_bench.hands.poses import RestSkeleton, posed_skeleton, rest_skeleton, t
 from hwp_bench.sim.effects import plan_frame
 from hwp_bench.sim.light.lights import focus_point
 from hwp_bench.sim.produce.capture import true_hands
-from hwp_bench.sim.produce.estimates import estimate_hands
-from hwp_bench.sim.produce.tracker import (
-    HABIT,
+from hwp_bench.sim.produce.estimates import (
     MEMORY,
+    TRACKER_HABIT,
     ParameterErrors,
     curl,
     edge_on,
+    estimate_hands,
     growth,
     landmark_noise,
     parameter_errors,
     wandering,
 )
-from hwp_bench.sim.scene.motion import hand_parameters, moment_of_key
-from hwp_bench.sim.scene.scene import Estimator, HandKey, Scene, with_effects
+from hwp_bench.sim.scene.scene import (
+    Estimator,
+    HandKey,
+    Scene,
+    hand_parameters,
+    moment_of_key,
+    with_effects,
+)
 
 SceneMaker = Callable[..., Scene]
 FRAMES = 60
@@ -72,7 +78,7 @@ def test_noise_remembers_as_it_says(step: float) -> None:
         expected = (1.0 + x) * np.exp(-x)
         assert (walk[lag:] * walk[:-lag]).mean() == pytest.approx(expected, abs=0.03)
     noise = landmark_noise(np.random.default_rng(3), 400, 10.0)
-    assert np.square(noise.mean(axis=0)).mean() == pytest.approx(HABIT, abs=0.05)
+    assert np.square(noise.mean(axis=0)).mean() == pytest.approx(TRACKER_HABIT, abs=0.05)
 
 
 def test_fists_and_edges_are_harder() -> None:

@@ -19,12 +19,11 @@ from hwp_bench.hands.anchors import HandSurfaces
 from hwp_bench.hands.raster import overlap
 from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.request import frame_choice, known_oracle_inputs, open_request, write_request
-from hwp_bench.sim.hand.off_template import SubjectAnatomy
+from hwp_bench.sim.hand.anatomy import SubjectAnatomy
 from hwp_bench.sim.light.lights import focus_point
 from hwp_bench.sim.produce.capture import render_capture
 from hwp_bench.sim.produce.truth import add_subject_mesh, subject_template, subject_templates
-from hwp_bench.sim.scene.motion import hand_parameters, moment_of_key
-from hwp_bench.sim.scene.scene import HandKey, Scene
+from hwp_bench.sim.scene.scene import HandKey, Scene, hand_parameters, moment_of_key
 from hwp_bench.sim.subject.hand import subject_hand, template_vertices
 from hwp_bench.sim.subject.subject import Subject
 

@@ -17,12 +17,19 @@ from tiny_scene import BLUR, CLEAN
 
 from hwp_bench.base.errors import BadInput
 from hwp_bench.sim.effects import plan_frame
-from hwp_bench.sim.props import backdrops as planes
-from hwp_bench.sim.props.backdrops import backdrop_colors, plane_names
-from hwp_bench.sim.props.behind import NOTHING, Behind, Clutter, Face, OtherArm, draw_behind
+from hwp_bench.sim.props import behind as planes
+from hwp_bench.sim.props.behind import (
+    NOTHING,
+    Behind,
+    Clutter,
+    Face,
+    OtherArm,
+    backdrop_colors,
+    draw_behind,
+    plane_names,
+)
 from hwp_bench.sim.render.frame import SimulatedFrame, render_frame
-from hwp_bench.sim.scene.motion import intrinsics, pixel_rays
-from hwp_bench.sim.scene.scene import Scene
+from hwp_bench.sim.scene.scene import Scene, intrinsics, pixel_rays
 from hwp_bench.sim.scene_files import load_scene
 from hwp_bench.sim.sensor import Sensor
 

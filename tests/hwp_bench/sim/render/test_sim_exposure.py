@@ -18,10 +18,9 @@ from tiny_scene import CLEAN, LIGHT, OBJECT
 from hwp_bench.base.colors import LUMINANCE
 from hwp_bench.base.errors import BadInput
 from hwp_bench.sim.effects import plan_frame
-from hwp_bench.sim.geometry.rays import RenderCost
-from hwp_bench.sim.render import exposure as metering
-from hwp_bench.sim.render.exposure import metered_gain
-from hwp_bench.sim.render.frame import render_frame
+from hwp_bench.sim.geometry.surface import RenderCost
+from hwp_bench.sim.render import frame as metering
+from hwp_bench.sim.render.frame import metered_gain, render_frame
 from hwp_bench.sim.scene.scene import Scene, with_effects
 from hwp_bench.sim.sensor import AutoControl, Sensor, sharpened
 

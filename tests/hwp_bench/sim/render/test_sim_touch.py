@@ -11,9 +11,9 @@ import pytest
 from scipy.spatial import cKDTree
 
 from hwp_bench.sim.effects import hands_at
-from hwp_bench.sim.geometry.rays import RenderCost
+from hwp_bench.sim.geometry.surface import RenderCost
 from hwp_bench.sim.render.stage import Stage
-from hwp_bench.sim.scene.motion import scene_hands
+from hwp_bench.sim.scene.scene import scene_hands
 from hwp_bench.sim.scene_files import load_scene, scene_names
 from hwp_bench.sim.subject.hand import MOVING
 

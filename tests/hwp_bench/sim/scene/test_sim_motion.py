@@ -14,8 +14,9 @@ from hwp_bench.base.errors import BadInput
 from hwp_bench.hands import load_template
 from hwp_bench.hands.poses import LIMITS, finger_pose, gesture, gestures, within_limits
 from hwp_bench.sim.light.lights import focus_point
-from hwp_bench.sim.scene.motion import (
+from hwp_bench.sim.scene.scene import (
     HandMoment,
+    Scene,
     hand_parameters,
     heading_matrix,
     intrinsics,
@@ -23,7 +24,6 @@ from hwp_bench.sim.scene.motion import (
     track_moment,
     viewmat,
 )
-from hwp_bench.sim.scene.scene import Scene
 from hwp_bench.sim.scene_files import parse_scene
 from hwp_bench.sim.subject.hand import template_vertices
 

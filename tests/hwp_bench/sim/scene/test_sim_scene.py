@@ -11,12 +11,15 @@ from tiny_scene import SINGLE
 
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.capture.splits import contiguous_split
-from hwp_bench.sim.produce.suites import suite, suite_names
-from hwp_bench.sim.scene.motion import clean_share, level, moments, severity
+from hwp_bench.sim.produce.capture import suite, suite_names
 from hwp_bench.sim.scene.scene import (
     CLEAN_FROM,
     MIN_CLEAN_SHARE,
     Scene,
+    clean_share,
+    level,
+    moments,
+    severity,
     with_effects,
     with_severity,
     with_subject,

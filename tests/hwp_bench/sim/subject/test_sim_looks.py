@@ -17,15 +17,13 @@ from hypothesis import strategies as st
 from hwp_bench.base.errors import BadInput
 from hwp_bench.hands.poses import FIRST_JOINT
 from hwp_bench.sim.effects import hands_at, plan_frame
-from hwp_bench.sim.geometry.rays import RenderCost
+from hwp_bench.sim.geometry.surface import RenderCost
 from hwp_bench.sim.hand.anatomy import Anatomy
 from hwp_bench.sim.render.frame import render_frame
 from hwp_bench.sim.render.stage import Stage
 from hwp_bench.sim.scene.scene import Scene
-from hwp_bench.sim.subject.arms import wrist_loop
-from hwp_bench.sim.subject.hand import subject_hand
-from hwp_bench.sim.subject.mounts import ring_mounts
-from hwp_bench.sim.subject.skin import of_side, painted, sample_skin
+from hwp_bench.sim.subject.arms import ring_mounts, wrist_loop
+from hwp_bench.sim.subject.hand import of_side, painted, sample_skin, subject_hand
 from hwp_bench.sim.subject.subject import PLAIN, Looks, Subject
 from hwp_bench.sim.subject.wear import Glove, Polish, Ring, Tattoo, WristWear
 
