@@ -51,10 +51,7 @@ class RigMesh:
 
 
 def kept(mesh: RigMesh, faces: np.ndarray) -> RigMesh:
-    """Some of a mesh's triangles, with the vertices that they use.
-
-    Takes `faces` (F,) bool.
-    """
+    """The triangles of a mesh that are asked for, (F,) bool, with the vertices that they use."""
     used, corner = np.unique(mesh.faces[faces], return_inverse=True)
     used_uv, corner_uv = np.unique(mesh.face_uv[faces], return_inverse=True)
     return RigMesh(
@@ -77,10 +74,7 @@ def components(faces: np.ndarray, count: int) -> np.ndarray:
 
 
 def cut(mesh: RigMesh, height: np.ndarray) -> RigMesh:
-    """The part of a mesh where a height is positive; triangles across zero are split.
-
-    Takes `height` (V,) m.
-    """
+    """The part of a mesh where a height (V,), m, is positive; triangles across zero are split."""
     height = np.where(np.abs(height) < _ON_PLANE, 0.0, height)
     sign = np.sign(height[mesh.faces])
     whole = (sign >= 0).all(axis=1) & (sign > 0).any(axis=1)
@@ -225,9 +219,8 @@ _AROUND = 0.6
 def opened_at_wrist(mesh: RigMesh, joints: np.ndarray, forward: np.ndarray, where: str) -> RigMesh:
     """Make a mesh that is open at the wrist and nowhere else.
 
-    Takes `joints` (16, 3) m, `forward` (3,) unit vector from the wrist to the fingers. Returns the
-    mesh; its only outline is the wrist's, whose middle lies at most `FARTHEST_BEHIND` behind and
-    `FARTHEST_BEFORE` before the wrist's joint.
+    The middle of the outline lies at most `FARTHEST_BEHIND` behind and `FARTHEST_BEFORE` before the
+    wrist's joint; `forward` (3,) leads from there to the fingers.
     """
     mesh = _of_the_hand(mesh, joints, where)
     rim = _wrist_outline(mesh, joints[0], forward)
@@ -267,10 +260,7 @@ def _of_the_hand(mesh: RigMesh, joints: np.ndarray, where: str) -> RigMesh:
 
 
 def _plane(mesh: RigMesh, behind: np.ndarray, forward: np.ndarray) -> float:
-    """How far behind the wrist's joint to cut, m: through skin around the arm, not its cap.
-
-    Takes `behind` (V,) m, `forward` (3,) unit vector.
-    """
+    """How far behind the wrist's joint to cut, m: through skin around the arm, not its cap."""
     a, b, c = (mesh.vertices[mesh.faces[:, corner]] for corner in range(3))
     normal = np.cross(b - a, c - a)
     back = -normal @ forward > _FACES_BACK * np.linalg.norm(normal, axis=1)
@@ -380,10 +370,7 @@ def is_elsewhere(name: str, side: str | None) -> bool:
 
 
 def hand_joints(names: list[str], wanted: str, where: str) -> tuple[list[int], str | None]:
-    """Find the joints of a hand.
-
-    Returns row in `names` of the hand model's 16 joints, and the side that the names tell, if any.
-    """
+    """Rows in `names` of the hand model's 16 joints, and the side that the names tell, if any."""
     plain = [_plain(name.lower()) for name in names]
     sides = {side_of_name(name) for name in names}
     for scheme in (WEBXR, OPENXR):
@@ -482,9 +469,7 @@ def into_rest_pose(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Turn every finger bone to where the hand model's points, by linear blend skinning.
 
-    Takes `vertices` (V, 3) m, `weights` (V, 16), `joints` (16, 3) m, `tips` (5, 3) m, `target` (16,
-    3) m, `target_tips` (5, 3) m. Returns (V, 3) vertices and (16, 3) joints; bones keep their
-    lengths.
+    Returns (V, 3) vertices and (16, 3) joints, m; bones keep their lengths.
     """
     ends, target_ends = _bone_ends(joints, tips), _bone_ends(target, target_tips)
     turns = np.tile(np.eye(3), (JOINT_COUNT, 1, 1))
@@ -553,10 +538,9 @@ def rig_path(model: str) -> str | None:
 
 
 def load_rig(path: str, side: str, model: HandTemplate) -> tuple[HandTemplate, np.ndarray | None]:
-    """Read a rigged hand.
+    """Read a rigged hand as a template without shape parameters, open at the wrist only.
 
-    Returns the rig as a template without shape parameters, open at the wrist only, and its base
-    colour, (H, W, 3) uint8 sRGB, or None if it has none.
+    Also its base colour, (H, W, 3) uint8 sRGB, or None if it has none.
     """
     file = read_skinned_mesh(Path(path))
     index, told = hand_joints(file.joint_names, side, path)
@@ -569,10 +553,7 @@ def load_rig(path: str, side: str, model: HandTemplate) -> tuple[HandTemplate, n
 
 
 def _side_by_curl(places: np.ndarray) -> str:
-    """The side of a hand by where its fingers curl.
-
-    Takes `places` (16, 3) of the hand model's joints in the rig.
-    """
+    """The side of a hand by where its fingers curl."""
     back_if_right = np.cross(places[4] - places[0], places[1] - places[7])
     curl = sum(places[i + 2] - places[i] for i in (1, 4, 7, 10, 13))
     return "right" if curl @ back_if_right < 0 else "left"
