@@ -525,11 +525,7 @@ def _screen_way(scene: Scene, seconds: float, shutter: Shutter, size: int) -> fl
 
 
 def _strength_at(call: EffectCall, level: float) -> float:
-    """Strength at a level from 0 (absent) to 5, interpolated between severities.
-
-    Strengths at severity 1 to 5 are the scene's own where it was calibrated
-    (`hwp-bench sim calibrate`), else the effect's.
-    """
+    """Strength at a level from 0 (absent) to 5, interpolated between severities."""
     strengths = call.strengths or EFFECTS[call.kind].default_strengths
     table = (0.0, *strengths)
     return float(np.interp(level, np.arange(len(table)), table))

@@ -21,10 +21,9 @@ if TYPE_CHECKING:
 
 
 def subdivision(faces: np.ndarray, vertex_count: int) -> tuple[csr_matrix, np.ndarray]:
-    """One midpoint subdivision, written as a matrix.
+    """One midpoint subdivision: its (4 F, 3) faces, after the (V', V) matrix of per-vertex values.
 
-    Takes `faces` (F, 3). Returns (V', V) sparse matrix that turns per-vertex values into those of
-    the finer mesh, the first V rows unchanged, and its (4F, 3) faces.
+    The first V rows of the matrix leave the values as they are.
     """
     from scipy.sparse import csr_matrix
 
@@ -43,9 +42,7 @@ def subdivision(faces: np.ndarray, vertex_count: int) -> tuple[csr_matrix, np.nd
 
 
 def smoothing(faces: np.ndarray, vertex_count: int, rounds: int) -> csr_matrix:
-    """Taubin smoothing as one matrix: rounds facets off without shrinking.
-
-    The boundary stays where it is.
+    """Taubin smoothing as one matrix: rounds facets off without shrinking; the boundary stays.
 
     Source: Taubin, "A signal processing approach to fair surface design" (lambda 0.5, mu -0.53).
     """
@@ -86,10 +83,7 @@ def normal_operator(faces: np.ndarray, vertex_count: int) -> csr_matrix:
 
 
 def surface_normals(vertices: np.ndarray, faces: np.ndarray, operator: csr_matrix) -> np.ndarray:
-    """Unit normals at the vertices, weighted by area: (V, 3).
-
-    Takes `vertices` (V, 3), `faces` (F, 3).
-    """
+    """Unit normals at the vertices, weighted by area: (V, 3)."""
     a, b, c = (vertices[faces[:, corner]] for corner in range(3))
     return unit(operator @ np.cross(b - a, c - a))
 
@@ -230,10 +224,7 @@ def shape(
     *,
     smooth: bool,
 ) -> Surface:
-    """Make a surface that is not a hand.
-
-    Takes `vertices` (V, 3) m, `faces` (F, 3), `corner_uv` (F, 3, 2).
-    """
+    """Make a surface that is not a hand."""
     if not smooth:
         vertices = vertices[faces].reshape(-1, 3)
         faces = np.arange(len(vertices)).reshape(-1, 3)
@@ -272,10 +263,7 @@ def box(size: tuple[float, float, float], material: Material) -> Surface:
 
 
 def turned(profile: np.ndarray, material: Material, around: int = 28) -> Surface:
-    """A solid of revolution about z.
-
-    Takes `profile` (K, 2) rows of (radius, z) from one end to the other.
-    """
+    """A solid of revolution about z, of rows of (radius, z) from one end to the other."""
     angles = np.linspace(0.0, 2.0 * np.pi, around + 1)
     radius, z = profile[:, 0], profile[:, 1]
     vertices = np.stack(
@@ -290,10 +278,7 @@ def turned(profile: np.ndarray, material: Material, around: int = 28) -> Surface
 
 
 def tube(spine: np.ndarray, radius: np.ndarray, material: Material, *, around: int = 12) -> Surface:
-    """A tube with closed ends around a curve that runs along neither x nor y for long.
-
-    Takes `spine` (K, 3) m, `radius` (K,) m at each of its points.
-    """
+    """A tube with closed ends around a curve that runs along neither x nor y for long."""
     way = np.gradient(spine, axis=0)
     way /= np.linalg.norm(way, axis=1, keepdims=True)
     # The same axis everywhere, so that the tube does not twist.
@@ -362,20 +347,14 @@ class Hits:
 
 
 class Tracer:
-    """One mesh, ready to be asked what rays meet.
-
-    Takes `vertices` (V, 3) m, `faces` (F, 3) vertex indices.
-    """
+    """One mesh, ready to be asked what rays meet."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, rays: Counter[str]) -> None:
         self._mesh = ray_mesh(vertices, faces)
         self._rays = rays
 
     def first_hits(self, origins: np.ndarray, directions: np.ndarray, purpose: str) -> Hits:
-        """Find the first face on every ray.
-
-        Takes `origins` (N, 3) m, `directions` (N, 3).
-        """
+        """Find the first face on every ray."""
         self._rays[purpose] += len(directions)
         ray, face, u, v, distance = self._mesh.first_hits(origins, directions)
         return Hits(ray, face, np.stack([1.0 - u - v, u, v], axis=1), distance)

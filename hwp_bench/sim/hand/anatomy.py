@@ -175,8 +175,8 @@ class Anatomy:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Where places lie on a finger's nail: (N,) each.
 
-        Returns along the plate from -1 to 1 at its free edge, across it from -1 to 1, 1 on top of
-        the finger, and 1 on its last segment.
+        Along the plate from -1 to 1 at its free edge, across it from -1 to 1, 1 on top of the
+        finger, and 1 on its last segment.
         """
         joint = self.joints[FIRST_JOINT[finger] + 2]
         tip = self._tip(finger)
@@ -218,10 +218,7 @@ def _rounded(bends: np.ndarray, samples: int = 24) -> np.ndarray:
 
 
 def _drawn(places: np.ndarray, line: np.ndarray, width: float) -> np.ndarray:
-    """A line with soft borders: 1 on it, exp(-1) at `width` from it: (N,).
-
-    Takes `places` (N, 2), `line` (K, 2) points joined by segments.
-    """
+    """A line through (K, 2) points with soft borders: 1 on it, exp(-1) at `width` from it: (N,)."""
     reach = width * np.sqrt(_LOST)
     low, high = line.min(axis=0) - reach, line.max(axis=0) + reach
     found = np.zeros(len(places))
@@ -305,11 +302,10 @@ _SOFTEST, _SHARPEST = 24, 3.0
 def off_template(
     template: HandTemplate, betas: np.ndarray, anatomy: SubjectAnatomy, seed: int
 ) -> tuple[HandTemplate, np.ndarray]:
-    """Give a hand model another anatomy.
+    """Give a hand model with these betas (10,) another anatomy.
 
-    Takes `betas` (10,) its shape. Returns A template of the same triangles without shape
-    parameters, which bends about the moved joints, and the (16, 3) joints where they were before
-    they were moved, m.
+    Returns a template of the same triangles without shape parameters, which bends about the moved
+    joints, and the (16, 3) joints where they were before they were moved, m.
     """
     if template.side == "left":
         made, joints = off_template(mirror_template(template), betas, anatomy, seed)
@@ -349,12 +345,11 @@ def resized(
     palm_bones: np.ndarray,
     palm: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Scale the segments of a right hand at rest.
+    """Scale the segments of a right hand at rest: vertices (V, 3) and joints (16, 3), m.
 
-    Takes `vertices` (V, 3) m, `weights` (V, 16), `joints` (16, 3) m, `tips` (5, 3) m, `lengths`
-    (16,) factor along each segment's bone, `widths` (16,) factor across it, `palm_bones` (16,)
-    factor of the way from the wrist to each finger's first joint, `palm` (3,) further factors along
-    the fingers. Returns (V, 3) vertices and (16, 3) joints.
+    Takes `lengths` (16,) factor along each segment's bone, `widths` (16,) factor across it,
+    `palm_bones` (16,) factor of the way from the wrist to each finger's first joint, `palm` (3,)
+    further factors along the fingers.
     """
     wrist, axes = joints[0], palm[[0, 2, 1]]
     ends = np.vstack([joints[1:], wrist])
@@ -393,13 +388,10 @@ def reweighted(weights: np.ndarray, faces: np.ndarray, folds: float) -> np.ndarr
 
 
 def untangled(before: np.ndarray, after: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, bool]:
-    """A changed surface in which no triangle has turned over or nearly vanished.
+    """A changed surface in which no triangle has turned over or nearly vanished, if that succeeds.
 
     In the folds between fingers small triangles are squeezed. Around each that is, the change is
     averaged over wider and wider rings until it fits; the rest of the surface stays.
-
-    Takes `before` (V, 3) m, `after` (V, 3) m, `faces` (F, 3). Returns (V, 3) m, and whether that
-    succeeded.
     """
     step = smoothing_step(faces, len(before), 0.5)
     reach = (step > 0).astype(np.float64)
@@ -453,10 +445,7 @@ def _shifts(longest: float, seed: int) -> np.ndarray:
 def _palm_field(
     vertices: np.ndarray, joints: np.ndarray, roots: list[int], pushed: np.ndarray
 ) -> np.ndarray:
-    """How the palm's skin moves where its bones grow: (V, 3) m.
-
-    Takes `vertices` (V, 3) m, `joints` (16, 3) m, `pushed` (5, 3) m.
-    """
+    """How the palm's skin moves where its bones grow: (V, 3) m."""
     field, total = np.zeros_like(vertices), np.full(len(vertices), 1e-9)
     for root, push in zip(roots, pushed, strict=True):
         bone = joints[root] - joints[0]
@@ -487,10 +476,7 @@ class Nails:
     offsets: np.ndarray
 
     def pushed(self, vertices: np.ndarray, turns: np.ndarray) -> np.ndarray:
-        """The mesh with its nails.
-
-        Takes `vertices` (V, 3) m, `turns` (16, 3, 3) rotation of each joint from the rest frame.
-        """
+        """The mesh (V, 3) with its nails, which turn with the joints (16, 3, 3)."""
         grown = vertices.copy()
         grown[self.rows] += np.einsum("nij,nj->ni", turns[self.joints], self.offsets)
         return grown
@@ -527,8 +513,6 @@ def grown_nails(places: Anatomy, anatomy: SubjectAnatomy, mirror: np.ndarray) ->
 
     The free edge of the painted nail is drawn out forwards; the skin below it stays, so that the
     nail is a blade.
-
-    Takes `mirror` (3,) signs that turn the anatomy's right hand into the hand's own side.
     """
     if not anatomy.nail_length:
         return None

@@ -175,10 +175,7 @@ def wall_radiance(room: Room, sky: float) -> np.ndarray:
 
 
 def wall_irradiance(radiance: np.ndarray) -> np.ndarray:
-    """Irradiance over pi in the middle of a cube of walls, for normals along the axes: (6, 3).
-
-    Takes `radiance` (6, 3) as `wall_radiance` gives it.
-    """
+    """Irradiance over pi in the middle of a cube of walls, for normals along the axes: (6, 3)."""
     behind = radiance.reshape(3, 2, 3)[:, ::-1].reshape(6, 3)
     borders = radiance.sum(axis=0) - radiance - behind
     return np.asarray(FACING_SHARE * radiance + BORDER_SHARE * borders)

@@ -25,14 +25,9 @@ def at_hits(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Geometry at the hits.
 
-    Args:
-        mesh: vertices (V, 3), normals (V, 3), faces (F, 3), texture coordinates (F, 3, 2).
-        hits: ray (H,), face (H,) and weights (H, 3) of each.
-        directions: (N, 3) of the rays.
-
-    Returns:
-        points (H, 3) m; unit vectors (H, 3) to the camera, of the face and of the smooth surface,
-        both turned to the camera; texture coordinates (H, 2).
+    Takes `mesh` vertices (V, 3), normals (V, 3), faces (F, 3), texture coordinates (F, 3, 2);
+    `hits` ray (H,), face (H,) and weights (H, 3). Returns points (H, 3); unit vectors (H, 3) to
+    the camera, of the face and of the smooth surface, both turned to the camera; and (H, 2).
     """
     vertices, vertex_normals, faces, corner_uv = mesh
     rays, hit_faces, weights = hits
@@ -99,14 +94,7 @@ _ONE = np.float32(1.0)
 
 @compiled(nogil=True)
 def read_texture(mine: np.ndarray, uv: np.ndarray, texture: np.ndarray, out: np.ndarray) -> None:
-    """Read a texture that repeats, between its four nearest texels.
-
-    Args:
-        mine: (M,) rows of `uv` and `out`.
-        uv: (H, 2) texture coordinates.
-        texture: (rows, columns, C) float32.
-        out: (H, C) float32, is written.
-    """
+    """Read a texture (rows, columns, C) that repeats, between its four nearest texels, into `out`."""
     for i in mine:
         x0, x1, y0, y1, fx, fy = _taps(uv[i], texture.shape[0], texture.shape[1])
         for k in range(texture.shape[2]):
@@ -124,15 +112,7 @@ def bump(
     mesh: tuple[np.ndarray, np.ndarray, np.ndarray],
     normals: np.ndarray,
 ) -> None:
-    """Tilt normals by a height map's slope on the posed surface.
-
-    Args:
-        mine: (M,) rows of `hit_faces`, `uv` and `normals`.
-        hit_faces: (H,) face of each point.
-        uv: (H, 2) texture coordinates.
-        height: (rows, columns) float32 m.
-        mesh: vertices (V, 3), faces (F, 3), texture coordinates (F, 3, 2).
-        normals: (H, 3) unit, are changed.
+    """Tilt the `normals` in the rows `mine` by a height map's slope on the posed surface.
 
     Source: Blinn, "Simulation of wrinkled surfaces", with the surface gradient
     grad h = h_u grad u + h_v grad v on each triangle.
@@ -223,10 +203,7 @@ class Samples:
 
 
 def gather(surface: Surface, hits: Hits, directions: np.ndarray) -> Samples:
-    """Collect what shading needs at the hits.
-
-    Takes `directions` (N, 3) of the rays that were cast.
-    """
+    """Collect what shading needs at the hits."""
     faces = np.ascontiguousarray(surface.faces, np.int64)
     vertices = np.ascontiguousarray(surface.vertices)
     corner_uv = np.ascontiguousarray(surface.corner_uv)
@@ -333,13 +310,12 @@ def radiance(
     lights: np.ndarray,
     exposure: float,
 ) -> np.ndarray:
-    """Radiance towards the camera: (H, 3) linear; `shading.shade` names model and sources.
+    """Radiance towards the camera: (H, 3) linear; `shade` names model and sources.
 
-    Args:
-        vectors: unit normals (H, 3) and unit vectors to the camera (H, 3).
-        maps: albedo (H, 3), wrap (H, 3), roughness, specular and glow (H,), all float32.
-        arrives: shares of the key light and of the sky that reach each point, (H,) float64.
-        lights: (4, 3) direction of the key light, its irradiance, radiance from above and below.
+    Takes `vectors` normals and unit vectors to the camera, (H, 3) each; `maps` albedo (H, 3), wrap
+    (H, 3), roughness, specular and glow (H,), all float32; `arrives` shares of the key light and of
+    the sky, (H,) float64; `lights` (4, 3) direction of the key light, its irradiance, radiance from
+    above and below.
     """
     normals, views = vectors
     albedo, wrap, roughness, specular, glow = maps
@@ -379,9 +355,7 @@ _DISC = np.array([[-0.4, -0.8], [0.8, -0.4], [-0.8, 0.4], [0.4, 0.8]])
 
 
 def shade(samples: Samples, lights: Lights, lit: np.ndarray) -> np.ndarray:
-    """Radiance towards the camera: (H, 3) linear.
-
-    Takes `lit` (H,) share of the key light that arrives.
+    """Radiance towards the camera, of the share of the key light that arrives: (H, 3) linear.
 
     Source: Lambert with wrapped terminator for skin, hemisphere sky, and the GGX lobe with
     Schlick's Fresnel term and Smith-Schlick visibility for the gloss.
@@ -398,10 +372,7 @@ def shade(samples: Samples, lights: Lights, lit: np.ndarray) -> np.ndarray:
 
 
 def openness(tracer: Tracer, vertices: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Share of the half space above each point, weighted by the cosine, that nothing near blocks.
-
-    Takes `vertices` (V, 3) m, `normals` (V, 3) unit. Returns (V,) 0-1.
-    """
+    """Share of the half space above each point, weighted by the cosine, that nothing near blocks."""
     index = np.arange(SKY_RAYS) + 0.5
     height = np.sqrt(1.0 - index / SKY_RAYS)
     spin = np.pi * (3.0 - np.sqrt(5.0)) * index
@@ -420,10 +391,9 @@ def openness(tracer: Tracer, vertices: np.ndarray, normals: np.ndarray) -> np.nd
 
 
 def lit(samples: Samples, lights: Lights, tracers: list[Tracer], turn: np.ndarray) -> np.ndarray:
-    """Whether the key light reaches each sample.
+    """Whether the key light reaches each sample: (H,) 0 or 1.
 
-    Takes `turn` (H,) 0-3. Returns (H,) 0 or 1. A point that faces away from the lamp is 1: its
-    normal darkens it.
+    A point that faces away from the lamp is 1: its normal darkens it.
     """
     if not lights.key.any():
         return np.ones(len(samples.ray))
@@ -498,10 +468,7 @@ _QUARTERS = np.array([[-0.5, -0.5], [0.5, -0.5], [-0.5, 0.5], [0.5, 0.5]])
 def lamp_light(
     samples: Samples, lights: Lights, tracers: list[Tracer], turn: np.ndarray
 ) -> np.ndarray:
-    """Radiance towards the camera that the lamps add: (H, 3) linear.
-
-    Takes `turn` (H,) 0-3.
-    """
+    """Radiance towards the camera that the lamps add: (H, 3) linear."""
     total = np.zeros((len(samples.ray), 3))
     passed = 1.0 if lights.cast is None else lights.cast.passed(samples.points)
     for lamp in lights.lamps:

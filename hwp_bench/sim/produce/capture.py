@@ -604,7 +604,7 @@ def _folder(item: SuiteItem, cache: str | os.PathLike[str] | None) -> Path:
 
 
 def workers_each(workers: int | None, engine: Engine, needs: Needs) -> int | None:
-    """Return the processes of one render: as asked for, else as many as the engine allows.
+    """The processes of one render: as asked for, else as many as the engine allows.
 
     In turn each render takes as many as are worth it; where several run at once, the processors
     of a job.

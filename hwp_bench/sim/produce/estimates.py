@@ -113,10 +113,7 @@ _WRIST, _INDEX, _MIDDLE, _LITTLE = 0, 5, 9, 17
 
 
 def curl(pose: np.ndarray) -> np.ndarray:
-    """How far the four fingers are bent: (F,), 0 straight to 1 fist.
-
-    Takes `pose` (F, 16, 3) axis-angle rad.
-    """
+    """How far the four fingers of poses (F, 16, 3) are bent: (F,), 0 straight to 1 fist."""
     four = [
         row
         for row, name in enumerate(JOINT_NAMES)
@@ -127,10 +124,7 @@ def curl(pose: np.ndarray) -> np.ndarray:
 
 
 def edge_on(landmarks: np.ndarray) -> np.ndarray:
-    """How far a palm is turned from the camera: (F,), 0 facing it or away, 1 seen from its edge.
-
-    Takes `landmarks` (F, 21, 3) m.
-    """
+    """How far a palm is turned from the camera: (F,), 0 facing it or away, 1 seen from its edge."""
     wrist = landmarks[:, _WRIST]
     normal = np.cross(landmarks[:, _INDEX] - wrist, landmarks[:, _LITTLE] - wrist)
     sight = landmarks[:, _MIDDLE]
@@ -169,10 +163,7 @@ def tracked(
     times: np.ndarray,
     views: np.ndarray,
 ) -> HandParameters:
-    """Add a tracker's errors to an estimate.
-
-    Takes `times` (F,) of the frames, `views` (F, 4, 4) world to camera.
-    """
+    """Add a tracker's errors to an estimate."""
     rng = generator(scene.seed, "tracker", side)
     failed = rng.uniform(size=len(times)) < settings.failures
     hand = scene_hands(scene)[side]
@@ -198,11 +189,7 @@ def parameter_errors(
     views: np.ndarray,
     noise: np.ndarray,
 ) -> ParameterErrors:
-    """Answer of a fit to wrong landmarks, to first order.
-
-    Takes `pose` (F, 16, 3) axis-angle rad, `transl` (F, 3) m, `views` (F, 4, 4) world to camera,
-    `noise` (F, 21, 5) unit noise of the landmarks.
-    """
+    """Answer of a fit to wrong landmarks, unit noise (F, 21, 5), to first order."""
     posed = posed_skeleton(rest, pose, transl).seen_by(views)
     grown = growth(curl(pose), edge_on(posed.landmarks))
     extent = hand_extent(posed.landmarks)
@@ -264,11 +251,7 @@ def confusable(scene: Scene) -> bool:
 def confused_mask(
     scene: Scene, plan: FramePlan, mask: np.ndarray, coverage: np.ndarray, rgb: np.ndarray
 ) -> np.ndarray:
-    """Add to an estimated mask what colours like skin do to it.
-
-    Takes `mask` (S, S) uint8, `coverage` (S, S) exact share of visible hand, `rgb` (S, S, 3) uint8
-    sRGB. Returns (S, S) uint8, 255 = hand.
-    """
+    """Add to an estimated mask, (S, S) uint8, what colours like skin do to it."""
     from scipy.ndimage import distance_transform_edt, gaussian_filter
 
     hand = coverage > 0.5
@@ -290,10 +273,7 @@ def confused_mask(
 
 
 def likeness(rgb: np.ndarray, coverage: np.ndarray) -> np.ndarray:
-    """How much every pixel looks like the hand of its frame: (S, S), 0-1.
-
-    Takes `rgb` (S, S, 3) uint8 sRGB, `coverage` (S, S) share of hand.
-    """
+    """How much every pixel looks like the hand of its frame: (S, S), 0-1."""
     import cv2
 
     smooth = cv2.GaussianBlur(rgb, (0, 0), max(len(rgb) / 256.0, 0.3))
@@ -307,10 +287,7 @@ def likeness(rgb: np.ndarray, coverage: np.ndarray) -> np.ndarray:
 
 
 def _errs(name: str, scene: Scene, plan: FramePlan, chance: np.ndarray) -> np.ndarray:
-    """Where one kind of error is: (S, S), 0-1. It wanders over the seconds.
-
-    Takes `chance` (S, S) 0-1.
-    """
+    """Where one kind of error is: (S, S), 0-1. It wanders over the seconds."""
     size = len(chance)
     ticks = (np.arange(size) + 0.5) / size
     x, y = np.meshgrid(ticks, ticks)
@@ -381,13 +358,10 @@ def estimate_hands(
 def estimate_mask(
     scene: Scene, plan: FramePlan, coverage: np.ndarray, clean_coverage: np.ndarray
 ) -> np.ndarray:
-    """Visible-hand mask as a segmenter gives it.
+    """Visible-hand mask as a segmenter gives it: (S, S) uint8, 255 = hand.
 
     Soft and slightly displaced borders, bites around occluders, parts of occluders taken for
     hand, smeared borders taken for hand, and sometimes a missed part.
-
-    Takes `coverage` (S, S) exact share of visible hand, `clean_coverage` (S, S) the same without
-    the occluders. Returns (S, S) uint8, 255 = hand.
     """
     from scipy.ndimage import gaussian_filter
 

@@ -289,12 +289,10 @@ def write_free_view(
 def render_free(
     scene: Scene, item: FreeView, size: int, gain: np.ndarray, cost: RenderCost
 ) -> tuple[FreeView, np.ndarray, np.ndarray]:
-    """Render one frame of the clip.
+    """Render one frame of the clip: the frame with the camera that was taken, image, and coverage.
 
     Where the hand is hidden, by the sleeve or by what is worn, the camera moves towards the
     fingers until some of it is seen.
-
-    Returns the frame with the camera that was taken, (S, S, 3) uint8 sRGB, (S, S) coverage 0-1.
     """
     for _ in range(_MOVES):
         rgb, coverage = render_view(scene, item.hands, item.view, size, gain, cost)

@@ -122,10 +122,8 @@ def write_truth(folder: Path, subject: Subject, sides: Sequence[str]) -> bool:
 def add_subject_mesh(capture: Capture) -> bool:
     """Write the subject's hands into a capture that was rendered before they were stored.
 
-    They follow from the scene that lies in the capture. Digests do not change.
-
-    Returns whether the capture has them now; False for other captures than simulated ones of the
-    free hand, and where the folder cannot be written to.
+    They follow from the scene that lies in the capture. Digests do not change. Returns whether the
+    capture has them now: only simulated ones of the free hand can.
     """
     path, source = capture.root / EXTRA / "scene.json", capture.info.source
     if (capture.root / TRUE_TEMPLATE).is_file():

@@ -186,10 +186,7 @@ def _texture(name: str, seed: int) -> np.ndarray:
 
 
 def backdrop_colors(name: str, seed: int, directions: np.ndarray) -> np.ndarray:
-    """The backdrop in each viewing direction, under white light.
-
-    Takes `directions` (H, W, 3) world. Returns (H, W, 3) linear reflectance.
-    """
+    """The backdrop in each viewing direction, under white light: (H, W, 3) linear reflectance."""
     import cv2
 
     slope = directions[..., :2] / np.maximum(directions[..., 2:], 1e-3)
@@ -291,10 +288,7 @@ def paint(
     color: np.ndarray,
     cover: Cover,
 ) -> None:
-    """Paint one shape into an image.
-
-    Takes `image` (H, W, 3) linear, `color` (3,) linear.
-    """
+    """Paint one shape into an image (H, W, 3), in a linear colour."""
     x, y = places
     rows = np.flatnonzero(np.abs(y[:, [0, -1]] - at[1]).min(axis=1) < reach)
     columns = np.flatnonzero(np.abs(x[[0, -1]] - at[0]).min(axis=0) < reach)
@@ -484,10 +478,7 @@ class _Grid:
 
 @lru_cache(maxsize=4)
 def face_picture(skin: tuple[float, float, float], seed: int, closed: bool) -> np.ndarray:
-    """Paint a face.
-
-    Returns (_ROWS, _COLUMNS, 4) float32: linear reflectance times opacity, and opacity.
-    """
+    """Paint a face: (_ROWS, _COLUMNS, 4) float32, linear reflectance times opacity, and opacity."""
     import cv2
 
     rng = generator(seed, "face")
@@ -602,11 +593,7 @@ def draw_behind(
     seconds: float,
     image: np.ndarray,
 ) -> np.ndarray:
-    """Draw clutter, face and arm, the nearest last: (H, W, 3) float64 linear reflectance.
-
-    Takes `directions` (H, W, 3) of the pixels, `image` (H, W, 3) linear reflectance of the
-    backdrop.
-    """
+    """Draw clutter, face and arm over a backdrop, the nearest last: (H, W, 3) linear reflectance."""
     drawn = image.astype(np.float64)
     half = float(np.tan(np.radians(field_of_view) / 2.0))
     slope = directions[..., :2] / np.maximum(directions[..., 2:], 1e-3) / half

@@ -287,10 +287,7 @@ class Rows:
 def knots(
     surface_at: Callable[[float], Surface], view_at: Callable[[float], np.ndarray], reach: float
 ) -> Knots:
-    """Take a surface at three instants, in the camera's axes.
-
-    Takes `view_at` (4, 4) world to camera at a time.
-    """
+    """A surface at three instants, in the camera's axes."""
     first, middle, last = (
         transformed(surface_at(time), view_at(time)) for time in (-reach / 2.0, 0.0, reach / 2.0)
     )
@@ -300,7 +297,7 @@ def knots(
 def row_by_row(at: Knots, reach: float, time: float, readout: float, lens: Lens) -> Surface:
     """A surface with every vertex where it stands when its row is read.
 
-    Returns the surface in the world, to be seen through `lens` as if all rows were read at once.
+    It is in the world, to be seen through `lens` as if all rows were read at once.
     """
     moments = np.full((len(at[0].vertices), 1), time)
     for _ in range(_ROUNDS):
@@ -410,13 +407,10 @@ def render_view(
     gain: np.ndarray,
     cost: RenderCost,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Render hands without objects, blur, noise and compression.
+    """Render hands without objects, blur, noise and compression: (S, S, 3) uint8, and coverage.
 
     Lamps, windows and walls stay where they are in the world. The backdrop is the one that the
     scene's own camera sees, and nothing moves before it.
-
-    Takes `view` (4, 4) world to camera, `gain` (3,) what `steady_gain` returns. Returns (S, S, 3)
-    uint8 sRGB and (S, S) share of hand, 0-1.
     """
     stage = Stage(scene, cost)
     with cost.time("hands"):

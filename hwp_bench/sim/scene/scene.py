@@ -414,20 +414,17 @@ def heading_matrix(heading: np.ndarray, side: str) -> np.ndarray:
 
 
 def palm_of(joints: np.ndarray) -> np.ndarray:
-    """The middle of the palm of a hand at rest, which keys place: (3,) m.
-
-    Takes `joints` (16, 3) m.
-    """
+    """The middle of the palm of a hand at rest, which keys place: (3,) m."""
     return 0.35 * joints[0] + 0.65 * joints[4]
 
 
 def hand_parameters(
     moment: HandMoment, side: str, joints: np.ndarray, focus: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Turn a moment into the hand model's pose and translation.
+    """Turn a moment into the hand model's pose, (16, 3) axis-angle rad, and translation, (3,) m.
 
     Takes `joints` (16, 3) rest joints of that side with the subject's shape, `focus` (3,) the point
-    that places are relative to. Returns pose (16, 3) axis-angle rad and transl (3,) m.
+    that places are relative to.
     """
     from scipy.spatial.transform import Rotation
 
@@ -478,10 +475,9 @@ def pixel_rays(
     grid: int,
     shift: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rays through a regular grid inside every pixel.
+    """Rays through a regular grid inside every pixel: origin (3,) and directions, world.
 
-    Takes `K` (3, 3) px, `view` (4, 4) world to camera. Returns origin (3,) m and directions (rows *
-    grid, columns * grid, 3), world, with length 1 along the camera's axis.
+    Directions (rows * grid, columns * grid, 3) have length 1 along the camera's axis.
     """
     top, bottom, left, right = box
     across = left + (np.arange((right - left) * grid) + 0.5 + shift[0]) / grid

@@ -58,10 +58,10 @@ def ringed(
     along: np.ndarray,
     material: Material,
 ) -> Surface:
-    """Join rings behind one another to a surface that looks outward and is not a hand.
+    """Join rings (R * K, 3) behind one another to a surface that looks outward and is not a hand.
 
-    Takes `vertices` (R * K, 3) m, `around` (K,) texture coordinate of each vertex of a ring,
-    `along` (R,) texture coordinate of each ring.
+    Takes texture coordinates, `around` of each vertex of a ring (K,) and of the next one, and
+    `along` of each ring (R,).
     """
     count, spokes = len(along), len(around[0])
     ring, spoke = np.meshgrid(np.arange(count - 1), np.arange(spokes), indexing="ij")
@@ -122,10 +122,7 @@ def wrist_rim(template: HandTemplate) -> np.ndarray:
 
 
 def sleeve(rim: np.ndarray, forward: np.ndarray, elbow: np.ndarray, material: Material) -> Surface:
-    """Build a sleeve from the rim of a posed wrist towards the elbow.
-
-    Takes `rim` (R, 3) m, `forward` (3,) unit vector from the wrist to the fingers, `elbow` (3,) m.
-    """
+    """Build a sleeve from the rim (R, 3) of a posed wrist towards the elbow."""
     center = rim.mean(axis=0)
     side = unit(rim[0] - center - ((rim[0] - center) @ forward) * forward)
     third = np.cross(forward, side)
@@ -202,11 +199,7 @@ def wrist_loop(subject: Subject, side: str, subdivisions: int = FINE) -> Rim:
 def forearm(
     rim: np.ndarray, around: np.ndarray, forward: np.ndarray, elbow: np.ndarray, skin: Material
 ) -> Surface:
-    """Build an arm from the rim of a posed wrist towards the elbow.
-
-    Takes `rim` (K, 3) m, `around` (K,) `Rim.around`, `forward` (3,) unit vector from the wrist to
-    the fingers, `elbow` (3,) m.
-    """
+    """Build an arm from the rim (K, 3) of a posed wrist towards the elbow."""
     vertices = _arm_rings(rim, forward, elbow)
     # From the middle of the first row of texels to that of the last: textures repeat beyond.
     rows = _ARM_TEXELS[0]
@@ -216,10 +209,7 @@ def forearm(
 
 
 def seamless(hand: Surface, arm: Surface, loop: np.ndarray) -> tuple[Surface, Surface]:
-    """Hand and arm with common normals where they meet.
-
-    Takes `loop` (K,) `Rim.loop`.
-    """
+    """Hand and arm with common normals where they meet, at the rim's `loop`."""
     common = unit(hand.normals[loop] + arm.normals[: len(loop)])
     of_hand, of_arm = hand.normals.copy(), arm.normals.copy()
     of_hand[loop] = common
@@ -370,12 +360,7 @@ class Mount:
     on_arm: bool
 
     def carried(self, vertices: np.ndarray) -> Surface:
-        """The thing on the posed hand (or arm), moved by the best rigid motion of its skin.
-
-        Takes `vertices` (V, 3) m of the posed hand.
-
-        Source: the Kabsch algorithm.
-        """
+        """The thing on the posed hand (or arm), moved by the best rigid motion of its skin."""
         now = vertices[self.near]
         a, b = self.places - self.places.mean(axis=0), now - now.mean(axis=0)
         u, _, vt = np.linalg.svd(b.T @ a)
@@ -466,10 +451,7 @@ def _wrist_mount(subject: Subject, side: str, item: WristWear, subdivisions: int
 
 
 def _outline(points: np.ndarray) -> np.ndarray:
-    """Radius of a section at `angles()`: (AROUND,) m, smooth, at most 5 % inside any point.
-
-    Takes `points` (N, 2) m around the origin.
-    """
+    """Radius of (N, 2) points at `angles()`: (AROUND,) m, smooth, at most 5 % inside any point."""
     turn = np.arctan2(points[:, 1], points[:, 0])
     radius = np.linalg.norm(points, axis=1)
 

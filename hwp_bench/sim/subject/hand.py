@@ -63,10 +63,7 @@ _STEPS, _STEP = 32, 0.0003
 
 
 def freckles(points: np.ndarray, amount: float, rng: np.random.Generator) -> np.ndarray:
-    """Round spots of 0.4 to 1.4 mm: (N,), 0 outside and up to 1 inside a spot.
-
-    Takes `points` (N, 3) m on the rest hand.
-    """
+    """Round spots of 0.4 to 1.4 mm at places (N, 3): (N,), 0 outside and up to 1 inside a spot."""
     ticks = [np.arange(low, high, _CELL) for low, high in _BOX]
     cells = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
     centers = cells + rng.uniform(0.0, _CELL, cells.shape)
@@ -87,10 +84,7 @@ def freckles(points: np.ndarray, amount: float, rng: np.random.Generator) -> np.
 
 
 def wrinkles(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """A net of fine folds, mostly across the fingers' direction: (N,), 0-1.
-
-    Takes `points` (N, 3) m on the rest hand.
-    """
+    """A net of fine folds, mostly across the fingers' direction: (N,), 0-1."""
     stretched = points * np.array([1.7, 0.8, 0.8])
     folds = np.zeros(len(points))
     for scale, strength in ((0.012, 1.0), (0.006, 0.6)):
@@ -106,11 +100,7 @@ def hair(
     amount: float,
     rng: np.random.Generator,
 ) -> np.ndarray:
-    """Fine strokes that follow the skin towards the finger tips and the little finger's side.
-
-    Takes `points` (N, 3) m on the rest hand, `normals` (N, 3) unit, `share` (N,) 0-1. Returns (N,)
-    0 (none) to 1 (covered by hair).
-    """
+    """Fine strokes that follow the skin towards the finger tips and the little finger's side: (N,) 0-1."""
     strokes = np.zeros(len(points))
     total = float(share.sum())
     if total <= 0.0:
@@ -335,9 +325,7 @@ _WIDEST = 3.0
 
 
 def betas_of_surface(model: HandTemplate, vertices: np.ndarray) -> np.ndarray:
-    """Betas whose surface is nearest to one of the same triangles: (10,).
-
-    Takes `vertices` (V, 3) m at rest.
+    """Betas whose surface is nearest to one of the same triangles, (V, 3) m: (10,).
 
     Source: bounded linear least squares, with a ridge on betas.
     """
@@ -359,9 +347,7 @@ def betas_of_surface(model: HandTemplate, vertices: np.ndarray) -> np.ndarray:
 
 
 def betas_of_joints(model: HandTemplate, joints: np.ndarray) -> np.ndarray:
-    """Betas whose bones have the lengths of a rig: (10,).
-
-    Takes `joints` (16, 3) m at rest.
+    """Betas whose bones have the lengths of a rig with joints (16, 3) m: (10,).
 
     Source: nonlinear least squares over 15 bones, with a ridge on betas.
     """
@@ -487,11 +473,7 @@ class SubjectHand:
         )
 
     def pose(self, pose: np.ndarray, transl: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pose the fine mesh.
-
-        Takes `pose` (16, 3) axis-angle rad, `transl` (3,) m. Returns vertices (V, 3) m and unit
-        normals (V, 3).
-        """
+        """Pose the fine mesh: vertices (V, 3) m and unit normals (V, 3)."""
         coarse = template_vertices(self.tensors, pose, self.betas, transl)
         smooth = self.lift @ coarse
         normals = surface_normals(smooth, self.faces, self.normal_sum)
@@ -521,10 +503,7 @@ def template_vertices(
 
 
 def joint_turns(pose: np.ndarray) -> np.ndarray:
-    """Rotation of each joint's segment from the rest frame to the world: (16, 3, 3).
-
-    Takes `pose` (16, 3) axis-angle rad.
-    """
+    """Rotation of each joint's segment from the rest frame to the world: (16, 3, 3)."""
     from scipy.spatial.transform import Rotation
 
     turns = Rotation.from_rotvec(pose).as_matrix()

@@ -60,10 +60,7 @@ class Looks:
                 raise UsageError("a hand wears two", field=name)
 
     def on(self, side: str) -> Looks:
-        """The looks of one hand: what the other one wears is left out.
-
-        Hands that look alike give equal looks, so that they share one painting.
-        """
+        """The looks of one hand; hands that look alike give equal looks and share one painting."""
 
         def worn(items: tuple[Any, ...]) -> tuple[Any, ...]:
             return tuple(
