@@ -84,7 +84,7 @@ def sensor_passes(sensor: Sensor) -> tuple[str, ...]:
 def record(
     sensor: Sensor, seed: int, frame: int, colors: tuple[np.ndarray, ...]
 ) -> tuple[np.ndarray, ...]:
-    """Add the same noise to the light that is counted, (S, S, 3) linear, of all versions of a frame."""
+    """Add the same noise to the light that is counted, (S, S, 3) linear, of each version."""
     if not sensor.noise:
         return colors
     rng = generator(seed, "sensor", frame)
@@ -109,7 +109,7 @@ def store(sensor: Sensor, image: np.ndarray) -> np.ndarray:
 
 
 def sharpened(image: np.ndarray, strength: float) -> np.ndarray:
-    """Unsharp mask on the luma, as a phone applies it after the tone curve: (H, W, 3) uint8 sRGB."""
+    """Unsharp mask on the luma, as a phone applies it after the tone curve: (H, W, 3) uint8."""
     import cv2
 
     luma = image.astype(np.float32) @ np.array(LUMA, dtype=np.float32)

@@ -94,7 +94,7 @@ _ONE = np.float32(1.0)
 
 @compiled(nogil=True)
 def read_texture(mine: np.ndarray, uv: np.ndarray, texture: np.ndarray, out: np.ndarray) -> None:
-    """Read a texture (rows, columns, C) that repeats, between its four nearest texels, into `out`."""
+    """Read a texture (rows, columns, C) that repeats, between its four nearest texels."""
     for i in mine:
         x0, x1, y0, y1, fx, fy = _taps(uv[i], texture.shape[0], texture.shape[1])
         for k in range(texture.shape[2]):
@@ -372,7 +372,7 @@ def shade(samples: Samples, lights: Lights, lit: np.ndarray) -> np.ndarray:
 
 
 def openness(tracer: Tracer, vertices: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Share of the half space above each point, weighted by the cosine, that nothing near blocks."""
+    """Share of the half space above each point, by the cosine, that nothing near blocks: (V,)."""
     index = np.arange(SKY_RAYS) + 0.5
     height = np.sqrt(1.0 - index / SKY_RAYS)
     spin = np.pi * (3.0 - np.sqrt(5.0)) * index

@@ -593,7 +593,7 @@ def draw_behind(
     seconds: float,
     image: np.ndarray,
 ) -> np.ndarray:
-    """Draw clutter, face and arm over a backdrop, the nearest last: (H, W, 3) linear reflectance."""
+    """Draw clutter, face and arm over a backdrop, the nearest last: (H, W, 3) linear."""
     drawn = image.astype(np.float64)
     half = float(np.tan(np.radians(field_of_view) / 2.0))
     slope = directions[..., :2] / np.maximum(directions[..., 2:], 1e-3) / half

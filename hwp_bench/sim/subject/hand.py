@@ -100,7 +100,7 @@ def hair(
     amount: float,
     rng: np.random.Generator,
 ) -> np.ndarray:
-    """Fine strokes that follow the skin towards the finger tips and the little finger's side: (N,) 0-1."""
+    """Fine strokes that follow the skin to the finger tips and the little finger's side: (N,)."""
     strokes = np.zeros(len(points))
     total = float(share.sum())
     if total <= 0.0:

@@ -360,7 +360,7 @@ def angles() -> np.ndarray:
 
 
 def band(outline: np.ndarray, width: float, thickness: float, material: Material) -> Surface:
-    """A closed band with a rounded section, its `outline` (AROUND,) m from the axis at `angles()`."""
+    """A closed band with a rounded section, its `outline` m from the axis at `angles()`."""
     turn = np.linspace(0.0, 2.0 * np.pi, _SECTION)
     # A superellipse: flat outside, round at the edges.
     along = 0.5 * width * np.sign(np.cos(turn)) * np.abs(np.cos(turn)) ** 0.6
