@@ -17,6 +17,7 @@ from hwp_bench.base.rays import ray_mesh
 from hwp_bench.hands.template import boundary_vertices
 
 if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
     from scipy.sparse import csr_matrix
 
 
@@ -98,6 +99,20 @@ def unit(vectors: np.ndarray) -> np.ndarray:
     """Vectors at length 1; zero stays zero."""
     length = np.sqrt(np.einsum("...i,...i->...", vectors, vectors))[..., None]
     return vectors / np.maximum(length, 1e-12)
+
+
+def perpendicular(vector: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """Unit vector of what of a vector is perpendicular to a unit axis, (3,) each."""
+    return unit(vector - (vector @ axis) * axis)
+
+
+def best_turn(places: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Rotation (3, 3) that brings centred places (N, 3) nearest to others (N, 3).
+
+    Source: the Kabsch algorithm.
+    """
+    u, _, vt = np.linalg.svd(target.T @ places)
+    return u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
 
 
 def _adjacency(faces: np.ndarray, vertex_count: int) -> csr_matrix:
@@ -190,6 +205,16 @@ def rigid(turn: np.ndarray | None, place: np.ndarray | tuple[float, float, float
     return move
 
 
+def reversed_faces(surface: Surface) -> Surface:
+    """A surface that looks to its other side."""
+    return replace(
+        surface,
+        faces=np.ascontiguousarray(surface.faces[:, ::-1]),
+        corner_uv=np.ascontiguousarray(surface.corner_uv[:, ::-1]),
+        normals=-surface.normals,
+    )
+
+
 def plain(color: tuple[float, float, float] | np.ndarray, **settings: float) -> Material:
     """A material of one linear colour."""
     albedo = np.asarray(color, dtype=np.float32).reshape(1, 1, 3)
@@ -262,19 +287,24 @@ def box(size: tuple[float, float, float], material: Material) -> Surface:
     return shape(vertices, faces, uv, material, smooth=False)
 
 
-def turned(profile: np.ndarray, material: Material, around: int = 28) -> Surface:
+def turned(profile: ArrayLike, material: Material, around: int = 28) -> Surface:
     """A solid of revolution about z, of rows of (radius, z) from one end to the other."""
-    angles = np.linspace(0.0, 2.0 * np.pi, around + 1)
-    radius, z = profile[:, 0], profile[:, 1]
-    vertices = np.stack(
-        [
-            radius[:, None] * np.cos(angles),
-            radius[:, None] * np.sin(angles),
-            np.broadcast_to(z[:, None], (len(z), len(angles))),
-        ],
-        axis=-1,
-    ).reshape(-1, 3)
-    return grid(vertices, len(profile), around + 1, material, flip=z[-1] < z[0])
+    profile = np.asarray(profile, dtype=np.float64)
+    radius, z = profile[:, :1], profile[:, 1:]
+    vertices = around_z(radius, z, np.linspace(0.0, 2.0 * np.pi, around + 1))
+    return grid(vertices, len(profile), around + 1, material, flip=profile[-1, 1] < profile[0, 1])
+
+
+def around_z(
+    radius: np.ndarray, z: np.ndarray, angles: np.ndarray, tall: np.ndarray | None = None
+) -> np.ndarray:
+    """Vertices of K rings about z at A angles: (K * A, 3).
+
+    `radius` and `z`, and `tall`, the half axis along y of rings that are ellipses, are (K, A) or
+    (K, 1).
+    """
+    x, y = radius * np.cos(angles), (radius if tall is None else tall) * np.sin(angles)
+    return np.stack([x, y, np.broadcast_to(z, x.shape)], axis=-1).reshape(-1, 3)
 
 
 def tube(spine: np.ndarray, radius: np.ndarray, material: Material, *, around: int = 12) -> Surface:
@@ -308,6 +338,15 @@ def grid(
     faces = np.concatenate([quads[:, pick] for pick in order])
     corner_uv = np.concatenate([uv[:, pick] for pick in order])
     return shape(vertices, faces, corner_uv, material, smooth=True)
+
+
+def sheet(
+    vertices: np.ndarray, rows: int, columns: int, material: Material, outward: np.ndarray
+) -> Surface:
+    """A `grid` that looks along the directions `outward`, (V, 3) or (3,), in the mean."""
+    made = grid(vertices, rows, columns, material)
+    looks_in = (made.normals * outward).sum() < 0
+    return grid(vertices, rows, columns, material, flip=True) if looks_in else made
 
 
 def canvas(height: int, width: int, color: Color) -> np.ndarray:

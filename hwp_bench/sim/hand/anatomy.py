@@ -23,7 +23,7 @@ from hwp_bench.hands.poses import FIRST_JOINT, finger_back
 from hwp_bench.hands.skeleton import FINGERS, JOINT_COUNT, PARENTS
 from hwp_bench.hands.template import rebuilt
 from hwp_bench.sim.geometry.noise import fractal_noise, generator
-from hwp_bench.sim.geometry.surface import ease, smoothing_step, unit
+from hwp_bench.sim.geometry.surface import ease, perpendicular, smoothing_step, unit
 
 # Palm lines as rows of (along, across): 0-1 from the wrist to the middle knuckle, and from the
 # little finger's knuckle to the index finger's.
@@ -182,8 +182,7 @@ class Anatomy:
         tip = self._tip(finger)
         along = unit(tip - joint)
         length = np.linalg.norm(tip - joint)
-        axis = finger_back(finger)
-        axis = unit(axis - (axis @ along) * along)
+        axis = perpendicular(finger_back(finger), along)
         across = np.cross(along, axis)
         offset = (self.points - joint) / length
         s = (offset @ along - 0.70) / 0.27

@@ -18,7 +18,7 @@ SteamVR (`finger_index_0_r`).
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +28,7 @@ from hwp_bench.base.numerics import kd_tree
 from hwp_bench.hands import HandTemplate, mirror_template
 from hwp_bench.hands.skeleton import FINGERS, JOINT_COUNT, PARENTS, SHAPE_COUNT
 from hwp_bench.hands.template import make_template
+from hwp_bench.sim.geometry.surface import best_turn
 from hwp_bench.sim.hand.gltf import SkinnedMesh, paintable, read_skinned_mesh
 
 # Vertices nearer to a plane than this, m, count as on it, so that a cut leaves no slivers.
@@ -78,65 +79,49 @@ def cut(mesh: RigMesh, height: np.ndarray) -> RigMesh:
     height = np.where(np.abs(height) < _ON_PLANE, 0.0, height)
     sign = np.sign(height[mesh.faces])
     whole = (sign >= 0).all(axis=1) & (sign > 0).any(axis=1)
-    crossed = np.flatnonzero((sign > 0).any(axis=1) & (sign < 0).any(axis=1))
-    places = _Splits(mesh.faces, height, len(mesh.vertices))
-    seams = _Splits(mesh.face_uv, height, len(mesh.uv), mesh.faces)
-    faces, face_uv = [mesh.faces[whole]], [mesh.face_uv[whole]]
-    for face in crossed.tolist():
-        ring, ring_uv = [], []
-        for corner in range(3):
-            after = (corner + 1) % 3
-            if sign[face, corner] >= 0:
-                ring.append(int(mesh.faces[face, corner]))
-                ring_uv.append(int(mesh.face_uv[face, corner]))
-            if sign[face, corner] * sign[face, after] < 0:
-                ring.append(places.between(face, corner, after))
-                ring_uv.append(seams.between(face, corner, after))
-        for step in range(1, len(ring) - 1):
-            faces.append(np.array([[ring[0], ring[step], ring[step + 1]]]))
-            face_uv.append(np.array([[ring_uv[0], ring_uv[step], ring_uv[step + 1]]]))
+    crossed = (sign > 0).any(axis=1) & (sign < 0).any(axis=1)
+    heights, sign = height[mesh.faces[crossed]], sign[crossed]
+    faces, points = _split(mesh.faces[crossed], heights, sign, len(mesh.vertices))
+    face_uv, seams = _split(mesh.face_uv[crossed], heights, sign, len(mesh.uv))
     whole_mesh = RigMesh(
-        places.spread(mesh.vertices),
-        places.spread(mesh.weights),
-        np.concatenate(faces),
-        seams.spread(mesh.uv),
-        np.concatenate(face_uv),
+        _spread(mesh.vertices, points),
+        _spread(mesh.weights, points),
+        np.concatenate([mesh.faces[whole], faces]),
+        _spread(mesh.uv, seams),
+        np.concatenate([mesh.face_uv[whole], face_uv]),
     )
     return kept(whole_mesh, np.ones(len(whole_mesh.faces), dtype=bool))
 
 
-class _Splits:
-    """New points on edges that cross zero, each made once."""
+def _split(
+    faces: np.ndarray, heights: np.ndarray, sign: np.ndarray, count: int
+) -> tuple[np.ndarray, dict[tuple[int, int], float]]:
+    """The parts of faces above zero, and the share of the way of new points on crossed edges."""
+    shares: dict[tuple[int, int], float] = {}
+    index: dict[tuple[int, int], int] = {}
+    parts: list[list[int]] = []
+    for face, high, side in zip(faces.tolist(), heights.tolist(), sign.tolist(), strict=True):
+        ring: list[int] = []
+        for corner, after in ((0, 1), (1, 2), (2, 0)):
+            if side[corner] >= 0:
+                ring.append(face[corner])
+            if side[corner] * side[after] < 0:
+                (one, low), (other, top) = sorted(
+                    [(face[corner], high[corner]), (face[after], high[after])]
+                )
+                shares.setdefault((one, other), low / (low - top))
+                ring.append(index.setdefault((one, other), count + len(index)))
+        parts += [[ring[0], *ring[step : step + 2]] for step in range(1, len(ring) - 1)]
+    return np.array(parts, dtype=np.int64).reshape(-1, 3), shares
 
-    def __init__(
-        self, faces: np.ndarray, height: np.ndarray, count: int, owners: np.ndarray | None = None
-    ) -> None:
-        self._faces = faces
-        self._heights = height[faces if owners is None else owners]
-        self._count = count
-        self._made: dict[tuple[int, int], int] = {}
-        self._shares: list[float] = []
 
-    def between(self, face: int, corner: int, after: int) -> int:
-        """Index of the point on an edge of a face."""
-        one, other = int(self._faces[face, corner]), int(self._faces[face, after])
-        low, high = self._heights[face, corner], self._heights[face, after]
-        if one > other:
-            one, other, low, high = other, one, high, low
-        if (one, other) not in self._made:
-            self._made[one, other] = self._count + len(self._made)
-            self._shares.append(float(low / (low - high)))
-        return self._made[one, other]
-
-    def spread(self, values: np.ndarray) -> np.ndarray:
-        """Values of the old and the new points."""
-        if not self._made:
-            return values
-        ends = np.array(list(self._made))
-        share = np.array(self._shares)[:, None]
-        return np.concatenate(
-            [values, (1.0 - share) * values[ends[:, 0]] + share * values[ends[:, 1]]]
-        )
+def _spread(values: np.ndarray, shares: dict[tuple[int, int], float]) -> np.ndarray:
+    """Values of the old and the new points."""
+    if not shares:
+        return values
+    ends, share = np.array(list(shares)), np.array(list(shares.values()))[:, None]
+    between = (1.0 - share) * values[ends[:, 0]] + share * values[ends[:, 1]]
+    return np.concatenate([values, between])
 
 
 def outlines(faces: np.ndarray) -> list[np.ndarray]:
@@ -318,12 +303,6 @@ WEBXR = (
     *(f"{x}-finger-phalanx-{y}" for x in ("index", "middle", "pinky", "ring") for y in _THREE),
     *("thumb-metacarpal", "thumb-phalanx-proximal", "thumb-phalanx-distal"),
 )
-#: The same as OpenXR rigs name them, without the side's suffix.
-OPENXR = (
-    "wrist",
-    *(f"{x}_{y}" for x in ("index", "middle", "little", "ring") for y in _THREE),
-    *("thumb_metacarpal", "thumb_proximal", "thumb_distal"),
-)
 #: Words of a finger, in the hand model's order.
 _FINGERS = {
     "index": ("index", "forefinger", "pointer"),
@@ -363,38 +342,24 @@ def side_of_name(name: str) -> str | None:
     return found.pop() if len(found) == 1 else None
 
 
-def is_elsewhere(name: str, side: str | None) -> bool:
-    """Whether a joint belongs to the body or to the other hand."""
-    own = side_of_name(name)
-    return bool(_BODY & set(words(name))) or (side is not None and own not in (None, side))
-
-
 def hand_joints(names: list[str], wanted: str, where: str) -> tuple[list[int], str | None]:
     """Rows in `names` of the hand model's 16 joints, and the side that the names tell, if any."""
-    plain = [_plain(name.lower()) for name in names]
-    sides = {side_of_name(name) for name in names}
-    for scheme in (WEBXR, OPENXR):
-        if all(name in plain for name in scheme) and len(set(plain)) == len(plain):
-            own = {side_of_name(names[plain.index(name)]) for name in scheme}
-            return [plain.index(name) for name in scheme], own.pop() if len(own) == 1 else None
-    best: list[int | None] = []
+    best: list[int | None] = [None] * len(WEBXR)
     told: str | None = None
+    sides = {side_of_name(name) for name in names}
     for side in (wanted, None, "left" if wanted == "right" else "right"):
-        if side not in sides:
-            continue
-        found = _by_words(names, side)
-        if not best or best.count(None) > found.count(None):
+        found = _by_words(names, side) if side in sides else best
+        if found.count(None) < best.count(None):
             best, told = found, side
-    found_all = [row for row in best if row is not None]
-    if best and len(found_all) == len(best):
-        return found_all, told
-    missing = [WEBXR[i] for i, row in enumerate(best) if row is None] or list(WEBXR)
-    raise BadHandModel(
-        f"{len(missing)} joints are missing, the first is {missing[0]!r}",
-        where=where,
-        field="skins[0].joints",
-        remedy="Names of WebXR, OpenXR, Mixamo, VRM, SMPL-X, Unreal and Rigify are understood.",
-    )
+    missing = [name for name, row in zip(WEBXR, best, strict=True) if row is None]
+    if missing:
+        raise BadHandModel(
+            f"{len(missing)} joints are missing, the first is {missing[0]!r}",
+            where=where,
+            field="skins[0].joints",
+            remedy="Names of WebXR, OpenXR, Mixamo, VRM, SMPL-X, Unreal and Rigify are understood.",
+        )
+    return [row for row in best if row is not None], told
 
 
 def _by_words(names: list[str], side: str | None) -> list[int | None]:
@@ -404,25 +369,17 @@ def _by_words(names: list[str], side: str | None) -> list[int | None]:
         said = words(name)
         if side_of_name(name) != side or _ASIDE & set(said):
             continue
-        finger = _finger(said)
-        if finger is not None:
-            part = _part(said, finger)
+        named = [finger for word in said for finger in _FINGERS if word in _FINGERS[finger]]
+        if named:
+            part = _part(said, named[0])
             if part is not None:
-                fingers[finger].setdefault(part, row)
+                fingers[named[0]].setdefault(part, row)
         elif "wrist" in said or "hand" in said:
             wrists.append(("wrist" not in said, len(said), row))
     found: list[int | None] = [min(wrists)[2] if wrists else None]
     for finger in _FINGERS:
         found += _three(fingers[finger], thumb=finger == "thumb")
     return found
-
-
-def _finger(said: list[str]) -> str | None:
-    for word in said:
-        for finger, known in _FINGERS.items():
-            if word in known:
-                return finger
-    return None
 
 
 def _part(said: list[str], finger: str) -> str | None:
@@ -449,19 +406,12 @@ def _three(parts: dict[str, int], *, thumb: bool) -> list[int | None]:
     return [parts.get(part) for part in order]
 
 
-def _plain(name: str) -> str:
-    for ending in ("_r", "_l", ".r", ".l", "_right", "_left"):
-        name = name.removesuffix(ending)
-    return name
-
-
 # The last bone ends in skin, not in a joint; smaller differences of its direction are not sure.
 _UNSURE = np.radians(6.0)
 
 
 def into_rest_pose(
-    vertices: np.ndarray,
-    weights: np.ndarray,
+    mesh: RigMesh,
     joints: np.ndarray,
     tips: np.ndarray,
     target: np.ndarray,
@@ -478,21 +428,19 @@ def into_rest_pose(
         parent = PARENTS[joint]
         places[joint] = places[parent] + turns[parent] @ (joints[joint] - joints[parent])
         bone = turns[parent] @ (ends[joint] - joints[joint])
-        last = joint % 3 == 0
-        turns[joint] = (
-            _shortest_turn(bone, target_ends[joint] - target[joint], _UNSURE if last else 0.0)
-            @ turns[parent]
-        )
-    moved = np.zeros_like(vertices)
+        unsure = _UNSURE if joint in _LAST else 0.0
+        turn = _shortest_turn(bone, target_ends[joint] - target[joint], unsure)
+        turns[joint] = turn @ turns[parent]
+    moved = np.zeros_like(mesh.vertices)
     for joint in range(JOINT_COUNT):
-        there = (vertices - joints[joint]) @ turns[joint].T + places[joint]
-        moved += weights[:, joint, None] * there
+        there = (mesh.vertices - joints[joint]) @ turns[joint].T + places[joint]
+        moved += mesh.weights[:, joint, None] * there
     return moved, places
 
 
 def _bone_ends(joints: np.ndarray, tips: np.ndarray) -> np.ndarray:
     ends = np.vstack([joints[1:], joints[:1]])
-    ends[[15, 3, 6, 12, 9]] = tips
+    ends[list(_LAST)] = tips
     return ends
 
 
@@ -546,53 +494,25 @@ def load_rig(path: str, side: str, model: HandTemplate) -> tuple[HandTemplate, n
     index, told = hand_joints(file.joint_names, side, path)
     places = file.joint_places[index]
     own = told or side_of_name(Path(path).stem) or _side_by_curl(places)
-    template = _template(file, index, told, own, model, path)
-    if template.side != side:
-        template = mirror_template(template)
-    return template, file.sheet.texture
-
-
-def _side_by_curl(places: np.ndarray) -> str:
-    """The side of a hand by where its fingers curl."""
-    back_if_right = np.cross(places[4] - places[0], places[1] - places[7])
-    curl = sum(places[i + 2] - places[i] for i in (1, 4, 7, 10, 13))
-    return "right" if curl @ back_if_right < 0 else "left"
-
-
-def _template(
-    file: SkinnedMesh,
-    index: list[int],
-    told: str | None,
-    side: str,
-    model: HandTemplate,
-    path: str,
-) -> HandTemplate:
-    flip = np.array([1.0 if model.side == side else -1.0, 1.0, 1.0])
+    flip = np.array([1.0 if model.side == own else -1.0, 1.0, 1.0])
     target, target_tips = model.joints * flip, model.vertices[model.fingertips] * flip
-    places = file.joint_places[index]
     turn, scale = _alignment(places, target, path)
     joints = (places - places[0]) @ turn.T * scale + target[0]
     mesh = _welded(file, index, told, scale)
     vertices = (mesh.vertices - places[0] * scale) @ turn.T + target[0]
-    mesh = RigMesh(vertices, mesh.weights, mesh.faces, mesh.uv, mesh.face_uv)
-    forward = np.array([-1.0 if side == "right" else 1.0, 0.0, 0.0])
-    mesh = opened_at_wrist(mesh, joints, forward, path)
+    forward = np.array([-1.0 if own == "right" else 1.0, 0.0, 0.0])
+    mesh = opened_at_wrist(replace(mesh, vertices=vertices), joints, forward, path)
     if len(mesh.faces) > MAX_HAND_FACES:
-        raise BadHandModel(
-            f"the hand has {len(mesh.faces)} triangles, at most {MAX_HAND_FACES}",
-            where=path,
-            remedy="Decimate the mesh.",
-        )
+        problem = f"the hand has {len(mesh.faces)} triangles, at most {MAX_HAND_FACES}"
+        raise BadHandModel(problem, where=path, remedy="Decimate the mesh.")
     uv, face_uv = mesh.uv, mesh.face_uv
     if file.sheet.texture is None:
         uv, face_uv = paintable(uv, face_uv)
     tips = _fingertips(mesh, joints, path)
-    vertices, joints = into_rest_pose(
-        mesh.vertices, mesh.weights, joints, mesh.vertices[tips], target, target_tips
-    )
-    return make_template(
+    vertices, joints = into_rest_pose(mesh, joints, mesh.vertices[tips], target, target_tips)
+    template = make_template(
         name=f"gltf:{Path(path).name}",
-        side=side,
+        side=own,
         vertices=vertices,
         faces=mesh.faces,
         shape_basis=np.zeros((len(vertices), 3, SHAPE_COUNT)),
@@ -606,6 +526,14 @@ def _template(
         fingertips=tips,
         where=path,
     )
+    return template if own == side else mirror_template(template), file.sheet.texture
+
+
+def _side_by_curl(places: np.ndarray) -> str:
+    """The side of a hand by where its fingers curl."""
+    back_if_right = np.cross(places[4] - places[0], places[1] - places[7])
+    curl = sum(places[i + 2] - places[i] for i in (1, 4, 7, 10, 13))
+    return "right" if curl @ back_if_right < 0 else "left"
 
 
 def _welded(file: SkinnedMesh, index: list[int], told: str | None, scale: float) -> RigMesh:
@@ -618,54 +546,43 @@ def _welded(file: SkinnedMesh, index: list[int], told: str | None, scale: float)
     )
     faces = welded.reshape(-1)[file.faces]
     owner = np.zeros((len(file.joint_names), JOINT_COUNT))
-    owner[np.arange(len(owner)), _owners(file.joint_names, index, file.joint_parents)] = 1.0
-    elsewhere = np.array(
-        [is_elsewhere(name, told) and row not in index for row, name in enumerate(file.joint_names)]
-    )
+    elsewhere = np.zeros(len(file.joint_names))
+    for joint, name in enumerate(file.joint_names):
+        owner[joint, _owner(file, index, joint)] = 1.0
+        # The rest of the body, or the other hand.
+        other = told is not None and side_of_name(name) not in (None, told)
+        elsewhere[joint] = joint not in index and bool(_BODY & set(words(name)) or other)
     shares = file.weights[first]
     total = np.maximum(np.asarray(shares.sum(axis=1)).reshape(-1), 1e-9)
     weights = np.asarray((shares @ owner) / total[:, None])
     # A vertex that nothing moves stays with the palm.
     weights[weights.sum(axis=1) < 0.5, 0] = 1.0
     weights /= weights.sum(axis=1, keepdims=True)
-    away = np.asarray(shares @ elsewhere.astype(np.float64)) / total
+    away = np.asarray(shares @ elsewhere) / total
     solid = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
-    sheet = file.sheet
-    mesh = RigMesh(file.vertices[first] * scale, weights, faces, sheet.uv, sheet.faces)
+    mesh = RigMesh(file.vertices[first] * scale, weights, faces, file.sheet.uv, file.sheet.faces)
     return kept(mesh, solid & (away[faces].mean(axis=1) < 0.5))
 
 
-def _alignment(places: np.ndarray, target: np.ndarray, path: str) -> tuple[np.ndarray, float]:
-    """Rotation and scale that bring the rig's palm onto the hand model's.
+def _owner(file: SkinnedMesh, index: list[int], joint: int) -> int:
+    """Joint of the hand model that a joint of the rig hands its weights to."""
+    if joint in index:
+        return index.index(joint)
+    folded = any(part in file.joint_names[joint].lower() for part in _FOLDED)
+    while joint >= 0 and joint not in index:
+        joint = file.joint_parents[joint]
+    return 0 if folded or joint < 0 else index.index(joint)
 
-    Source: the Kabsch algorithm over the wrist and the four knuckles.
-    """
+
+def _alignment(places: np.ndarray, target: np.ndarray, path: str) -> tuple[np.ndarray, float]:
+    """Rotation and scale that bring the rig's wrist and knuckles onto the hand model's."""
     palm = [0, 1, 4, 7, 10]
     a = places[palm] - places[palm].mean(axis=0)
     b = target[palm] - target[palm].mean(axis=0)
     size = float(np.linalg.norm(a))
     if size < 1e-9:
         raise BadHandModel("has all joints of its palm in one place", where=path)
-    u, _, vt = np.linalg.svd(b.T @ (a / size))
-    turn = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-    return turn, float(np.linalg.norm(b)) / size
-
-
-def _owners(names: list[str], index: list[int], parents: list[int]) -> list[int]:
-    """Joint of the hand model that each joint of the rig hands its weights to."""
-    owners = []
-    for joint, name in enumerate(names):
-        folded = any(part in name.lower() for part in _FOLDED)
-        ancestor = joint
-        while ancestor >= 0 and ancestor not in index:
-            ancestor = parents[ancestor]
-        if joint in index:
-            owners.append(index.index(joint))
-        elif folded or ancestor < 0:
-            owners.append(0)
-        else:
-            owners.append(index.index(ancestor))
-    return owners
+    return best_turn(a / size, b), float(np.linalg.norm(b)) / size
 
 
 def _fingertips(mesh: RigMesh, joints: np.ndarray, path: str) -> np.ndarray:

@@ -13,7 +13,7 @@ import os
 import shutil
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -37,12 +37,12 @@ from hwp_bench.capture import (
 from hwp_bench.capture.schema import FREE_VIEW, SIMULATED
 from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.run.engine import Engine, Job, LocalEngine, Needs
-from hwp_bench.run.engine.job import OnProgress
+from hwp_bench.run.engine.job import OnProgress, ignore_progress
 from hwp_bench.run.engine.processes import THREADS, LocalJob, Stopped, WorkerLost, run_in_process
 from hwp_bench.sim.effects import FramePlan, hands_at, plan_frame
 from hwp_bench.sim.hand.rigs import rig_path
 from hwp_bench.sim.produce.estimates import confused_mask, estimate_hands, estimate_mask
-from hwp_bench.sim.produce.free_view import add_free_view, has_free_view, write_free_view
+from hwp_bench.sim.produce.free_view import has_free_view, write_free_view
 from hwp_bench.sim.produce.truth import distances, write_truth
 from hwp_bench.sim.render.frame import eight_bit_coverage, render_frame, write_layers
 from hwp_bench.sim.scene.scene import Scene, intrinsics, parameters_of, scene_hands, viewmat
@@ -60,8 +60,6 @@ LICENCE = "CC0-1.0"
 FRAMES, SIZES, MAX_WORKERS = (10, 100_000), (32, 1024), 1024
 # Frames below which a second process costs more than it saves.
 _FRAMES_PER_WORKER = 10
-# Seconds between two counts of the frames that wait.
-_COUNT_SECONDS = 1.0
 _REMEDY = "Finished frames are kept; the same command continues from there."
 
 
@@ -141,38 +139,27 @@ class RenderRequest:
 
     def __call__(self, inputs: Mapping[str, Path], output: Path, on_progress: OnProgress) -> None:
         """Render; see `hwp_bench.run.engine.job.Work`."""
-        ended = threading.Event()
-        watch = threading.Thread(target=self._count, args=(output, on_progress, ended), daemon=True)
-        watch.start()
-        try:
-            self.render(output)
-        finally:
-            ended.set()
-            watch.join()
+        self.render(output, on_progress)
 
-    def render(self, output: Path) -> None:
+    def render(self, output: Path, on_progress: OnProgress = ignore_progress) -> None:
         """Render into a folder, or use the capture that exists there if `keep` says so.
 
         The free-view clip of a capture that exists is rendered where it is missing.
         """
         if not self.keep:
-            _render(self.checked(), output)
+            _render(self.checked(), output, on_progress)
             return
         with exclusive(output, wait=True):
             if not _is_capture(output):
-                _render(replace(self.checked(), overwrite=True), output)
+                _render(replace(self.checked(), overwrite=True), output, on_progress)
             elif not self.is_whole(output):
-                add_free_view(self.checked().scene, open_capture(output))
+                capture = open_capture(output)
+                clip = output / FREE_VIEW
+                write_free_view(self.checked().scene, clip, capture.info, capture.hands)
 
     def is_whole(self, output: Path) -> bool:
         """Whether a folder holds a capture with all that is asked for."""
         return _is_capture(output) and (not self.free_view or has_free_view(output))
-
-    def _count(self, output: Path, on_progress: OnProgress, ended: threading.Event) -> None:
-        """Report how many frames of the unfinished capture exist."""
-        while not ended.wait(_COUNT_SECONDS):
-            waiting = sum(1 for _ in output.parent.glob(f".{output.name}.*/*.npz"))
-            on_progress(waiting, self.frames)
 
 
 def _is_capture(folder: Path) -> bool:
@@ -229,13 +216,12 @@ def render_capture(
         exr=exr,
         overwrite=overwrite,
         free_view=free_view,
-    ).checked()
-    out = place(out, "out")
-    _render(request, out)
-    return open_capture(out)
+    )
+    request.render(place(out, "out"))
+    return open_capture(place(out, "out"))
 
 
-def _render(request: RenderRequest, out: Path) -> None:
+def _render(request: RenderRequest, out: Path, on_progress: OnProgress) -> None:
     """Render a request that was checked."""
     if out.exists() and not request.overwrite and (out.is_file() or any(out.iterdir())):
         raise UsageError(
@@ -250,7 +236,7 @@ def _render(request: RenderRequest, out: Path) -> None:
             raise HwpError(f"cannot be made ({reason_of(error)})", where=waiting) from error
         try:
             start = time.perf_counter()
-            _render_missing(request, waiting)
+            _render_missing(request, waiting, on_progress)
             _assemble(request, waiting, out, time.perf_counter() - start)
             shutil.rmtree(waiting, ignore_errors=True)
         finally:
@@ -261,7 +247,7 @@ def _render(request: RenderRequest, out: Path) -> None:
                 waiting.with_name(f"{waiting.name}.lock").unlink()
 
 
-def _render_missing(request: RenderRequest, waiting: Path) -> None:
+def _render_missing(request: RenderRequest, waiting: Path, on_progress: OnProgress) -> None:
     scene = request.scene
     missing = [frame for frame in range(request.frames) if _read_frame(waiting, frame) is None]
     if not missing:
@@ -273,13 +259,17 @@ def _render_missing(request: RenderRequest, waiting: Path) -> None:
     workers = request.workers
     if workers is None:
         workers = max(1, min(os.cpu_count() or 1, len(missing) // _FRAMES_PER_WORKER))
+    works = [RenderFrames(request, missing[first::workers]) for first in range(workers)]
     with progress(f"Rendering {scene.id}", len(missing)) as update:
+
+        def count(done: int, total: int) -> None:
+            update(done)
+            on_progress(request.frames - len(missing) + done, request.frames)
+
         if workers == 1:
-            RenderFrames(request, missing)({}, waiting, lambda done, total: update(done))
-            return
-        works = [RenderFrames(request, missing[first::workers]) for first in range(workers)]
-        _render_in_processes(works, waiting, update)
-        update(len(missing))
+            works[0]({}, waiting, count)
+        else:
+            _render_in_processes(works, waiting, count)
 
 
 @dataclass(frozen=True)
@@ -337,7 +327,7 @@ def _read_frame(folder: Path, frame: int) -> dict[str, np.ndarray] | None:
 
 
 def _render_in_processes(
-    works: Sequence[RenderFrames], folder: Path, on_progress: Callable[[int], None]
+    works: Sequence[RenderFrames], folder: Path, on_progress: OnProgress
 ) -> None:
     """Render frames in as many processes as there are works; if one fails, all are ended."""
     stop = threading.Event()
@@ -346,12 +336,13 @@ def _render_in_processes(
     def run(index: int) -> None:
         def count(steps: int, total: int) -> None:
             done[index] = steps
-            on_progress(sum(done))
+            on_progress(sum(done), sum(len(work.frames) for work in works))
 
         # One thread each: the processes share the processors.
         job = LocalJob(works[index], {}, folder.absolute(), dict.fromkeys(THREADS, "1"))
         try:
             run_in_process(job, count, stop.is_set)
+            count(len(works[index].frames), 0)
         except BaseException:
             stop.set()
             raise
@@ -368,12 +359,9 @@ def _render_in_processes(
             problem = f"a rendering process was killed ({error})"
             raise HwpError(problem, where=works[0].request.scene.id, remedy=_REMEDY) from error
         if isinstance(error, HwpError):
-            raise type(error)(
-                error.problem,
-                where=error.where,
-                field=error.field,
-                remedy=error.remedy or _REMEDY,
-            ) from error
+            remedy = error.remedy or _REMEDY
+            again = type(error)(error.problem, where=error.where, field=error.field, remedy=remedy)
+            raise again from error
         if error is not None and not isinstance(error, Stopped):
             raise error
 

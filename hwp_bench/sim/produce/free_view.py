@@ -18,7 +18,7 @@ import numpy as np
 from hwp_bench.base.console import progress
 from hwp_bench.base.errors import HwpError
 from hwp_bench.base.numerics import kd_tree
-from hwp_bench.capture import Cameras, Capture, CaptureInfo, CaptureWriter, open_capture
+from hwp_bench.capture import Cameras, CaptureInfo, CaptureWriter, open_capture
 from hwp_bench.capture.schema import FREE_VIEW, MAX_ID
 from hwp_bench.hands.poses import gestures, within_limits
 from hwp_bench.hands.skeleton import HandParameters
@@ -244,11 +244,6 @@ def has_free_view(capture: Path) -> bool:
     except HwpError:
         return False
     return clip.info.source.get("version") == VERSION
-
-
-def add_free_view(scene: Scene, capture: Capture) -> None:
-    """Render the clip into a capture of this scene that has none."""
-    write_free_view(scene, capture.root / FREE_VIEW, capture.info, capture.hands)
 
 
 def write_free_view(

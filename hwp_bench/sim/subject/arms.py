@@ -20,10 +20,14 @@ from hwp_bench.sim.geometry.noise import fractal_noise, generator
 from hwp_bench.sim.geometry.surface import (
     Material,
     Surface,
+    best_turn,
+    ease,
     join,
-    normal_operator,
+    perpendicular,
     plain,
-    surface_normals,
+    reversed_faces,
+    rigid,
+    shape,
     transformed,
     unit,
 )
@@ -38,6 +42,7 @@ from hwp_bench.sim.subject.hand import (
 )
 from hwp_bench.sim.subject.subject import Subject
 from hwp_bench.sim.subject.wear import (
+    UPRIGHT,
     Ring,
     WristWear,
     angles,
@@ -71,23 +76,14 @@ def ringed(
     faces = np.concatenate([np.stack([a, c, b], axis=1), np.stack([b, c, d], axis=1)])
     left, right = (side[spoke.ravel()] for side in around)
     near, far = (along[ring.ravel() + step] for step in (0, 1))
-    uv_a, uv_b = np.stack([left, near], 1), np.stack([right, near], 1)
-    uv_c, uv_d = np.stack([left, far], 1), np.stack([right, far], 1)
-    corner_uv = np.concatenate([np.stack([uv_a, uv_c, uv_b], 1), np.stack([uv_b, uv_c, uv_d], 1)])
-    normals = surface_normals(vertices, faces, normal_operator(faces, len(vertices)))
+    uv = [np.stack(at, axis=1) for at in ((left, near), (right, near), (left, far), (right, far))]
+    halves = [np.stack([uv[corner] for corner in half], 1) for half in ((0, 2, 1), (1, 2, 3))]
+    corner_uv = np.concatenate(halves)
+    made = shape(vertices, faces, corner_uv, material, smooth=True)
     middles = vertices.reshape(count, spokes, 3).mean(axis=1)
     outward = vertices - np.repeat(middles, spokes, axis=0)
-    if np.einsum("ni,ni->n", normals, outward).sum() < 0:
-        faces, corner_uv, normals = faces[:, ::-1], corner_uv[:, ::-1], -normals
-    return Surface(
-        vertices=vertices,
-        normals=normals,
-        faces=np.ascontiguousarray(faces),
-        corner_uv=np.ascontiguousarray(corner_uv),
-        material=np.zeros(len(faces), dtype=np.int64),
-        materials=(material,),
-        hand=np.zeros(len(faces), dtype=bool),
-    )
+    looks_in = np.einsum("ni,ni->n", made.normals, outward).sum() < 0
+    return reversed_faces(made) if looks_in else made
 
 
 # Rings along the arm, m behind the wrist's rim; the first two make the cuff's fold.
@@ -124,7 +120,7 @@ def wrist_rim(template: HandTemplate) -> np.ndarray:
 def sleeve(rim: np.ndarray, forward: np.ndarray, elbow: np.ndarray, material: Material) -> Surface:
     """Build a sleeve from the rim (R, 3) of a posed wrist towards the elbow."""
     center = rim.mean(axis=0)
-    side = unit(rim[0] - center - ((rim[0] - center) @ forward) * forward)
+    side = perpendicular(rim[0] - center, forward)
     third = np.cross(forward, side)
     angles = np.arctan2((rim - center) @ third, (rim - center) @ side)
     order = np.argsort(angles)
@@ -140,7 +136,7 @@ def sleeve(rim: np.ndarray, forward: np.ndarray, elbow: np.ndarray, material: Ma
         heading = unit(-forward + bend * (arm + forward))
         place = center + back * -forward if step < 4 else place + (back - previous) * heading
         previous = back
-        x = unit(side - (side @ heading) * heading)
+        x = perpendicular(side, heading)
         y = np.cross(x, heading)
         if y @ third < 0:
             y = -y
@@ -304,15 +300,12 @@ def _arm_rings(rim: np.ndarray, forward: np.ndarray, elbow: np.ndarray) -> np.nd
     widths = PchipInterpolator(_ARM_PLACES, _ARM_WIDTHS)
     rings, place, previous, heading = [], center, 0.0, -forward
     for back in _RING_PLACES:
-        bend = min(back / _BEND, 1.0)
-        turn = bend * bend * (3.0 - 2.0 * bend)
-        ahead = unit(-forward + turn * (arm + forward))
+        ahead = unit(-forward + ease(back / _BEND) * (arm + forward))
         x, y = _carried(x, heading, ahead), _carried(y, heading, ahead)
         heading = ahead
         place = place + (back - previous) * heading
         previous = back
-        settled = min(back / _SETTLE, 1.0)
-        settled = settled * settled * (3.0 - 2.0 * settled)
+        settled = ease(back / _SETTLE)
         size = float(widths(back))
         # A forearm gets rounder towards the elbow.
         tall = high + np.interp(back, (0.05, 0.25), (0.0, 0.75)) * (wide - high)
@@ -332,7 +325,7 @@ def _carried(axis: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndar
     cross, cosine = np.cross(before, after), float(before @ after)
     turned = axis + np.cross(cross, axis)
     turned = turned + np.cross(cross, np.cross(cross, axis)) / max(1.0 + cosine, 1e-9)
-    return unit(turned - (turned @ after) * after)
+    return perpendicular(turned, after)
 
 
 # Where a ring sits on the first bone, as a share of it.
@@ -362,12 +355,9 @@ class Mount:
     def carried(self, vertices: np.ndarray) -> Surface:
         """The thing on the posed hand (or arm), moved by the best rigid motion of its skin."""
         now = vertices[self.near]
-        a, b = self.places - self.places.mean(axis=0), now - now.mean(axis=0)
-        u, _, vt = np.linalg.svd(b.T @ a)
-        move = np.eye(4)
-        move[:3, :3] = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-        move[:3, 3] = now.mean(axis=0) - move[:3, :3] @ self.places.mean(axis=0)
-        return transformed(self.thing, move)
+        middle, place = self.places.mean(axis=0), now.mean(axis=0)
+        turn = best_turn(self.places - middle, now - place)
+        return transformed(self.thing, rigid(turn, place - turn @ middle))
 
 
 @lru_cache(maxsize=8)
@@ -394,8 +384,7 @@ def _ring_mount(hand: SubjectHand, ring: Ring) -> Mount:
     bone = unit(hand.joints[start + 1] - hand.joints[start])
     share = _ON_BONE.get(ring.finger, _ON_FINGER)
     place = hand.joints[start] + share * (hand.joints[start + 1] - hand.joints[start])
-    axis = finger_back(ring.finger) * mirror
-    axis = unit(axis - (axis @ bone) * bone)
+    axis = perpendicular(finger_back(ring.finger) * mirror, bone)
     frame = np.stack([np.cross(axis, bone), axis, bone], axis=1)
     rest = hand.rest_skin
     owned = hand.lift @ hand.template.weights[:, first : first + 3].sum(axis=1) > 0.5
@@ -407,11 +396,9 @@ def _ring_mount(hand: SubjectHand, ring: Ring) -> Mount:
     material = metal(ring.metal)
     parts = [band(outline, ring.width, _THICKNESS, material)]
     if ring.stone:
-        top = np.eye(4)
-        # z of the stone to y of the ring, on the back of the finger.
-        top[:3, :3] = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-        top[1, 3] = np.interp(0.5 * np.pi, angles(), outline) + _THICKNESS
-        parts.append(transformed(stone(ring.stone, ring.stone_color, material), top))
+        top = np.interp(0.5 * np.pi, angles(), outline) + _THICKNESS
+        gem = stone(ring.stone, ring.stone_color, material)
+        parts.append(transformed(gem, rigid(UPRIGHT, (0.0, top, 0.0))))
     count = len(hand.template.vertices)
     near = np.flatnonzero(owned[:count] & (np.abs(local[:count, 2]) < 0.007))
     return Mount(_placed(join(parts), frame, place, hand=True), near, rest[near], on_arm=False)
@@ -424,7 +411,7 @@ def _wrist_mount(subject: Subject, side: str, item: WristWear, subdivisions: int
     rim = rest[loop].mean(axis=0)
     bare = subject.looks.arm == "bare"
     forward = unit(hand.joints[4] - hand.joints[0])
-    back = unit(np.array([0.0, 1.0, 0.0]) - forward[1] * forward)
+    back = perpendicular(np.array([0.0, 1.0, 0.0]), forward)
     frame = np.stack([np.cross(back, forward), back, forward], axis=1)
     ahead = (_ON_ARM if bare else _BEFORE_SLEEVE)[item.kind]
     skin = rest_arm(subject, side, subdivisions) if bare else rest
@@ -467,7 +454,5 @@ def _outline(points: np.ndarray) -> np.ndarray:
 
 
 def _placed(thing: Surface, frame: np.ndarray, place: np.ndarray, *, hand: bool) -> Surface:
-    move = np.eye(4)
-    move[:3, :3], move[:3, 3] = frame, place
-    moved = transformed(thing, move)
+    moved = transformed(thing, rigid(frame, place))
     return replace(moved, hand=np.full(len(moved.faces), hand))

