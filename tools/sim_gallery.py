@@ -19,7 +19,7 @@ from hwp_bench.base.files import atomic_write, check_places
 from hwp_bench.sim.effects import EFFECTS, hands_at
 from hwp_bench.sim.geometry.noise import generator
 from hwp_bench.sim.geometry.surface import RenderCost
-from hwp_bench.sim.light.lights import Lamp, Light, Room, focus_point
+from hwp_bench.sim.light.lights import Lamp, Light, Room
 from hwp_bench.sim.produce.free_view import FRAMES, free_views, render_free
 from hwp_bench.sim.produce.preview import captioned, strip
 from hwp_bench.sim.props.behind import Behind, Clutter, Face, OtherArm
@@ -326,7 +326,7 @@ def _with_estimate(scene: Scene, call: EffectCall, result: SimulatedFrame) -> Si
     image = result.rgb.copy()
     for side, moment in hands_at(scene, seconds).items():
         hand = scene_hands(scene)[side]
-        pose, transl = hand_parameters(moment, side, hand.joints, focus_point())
+        pose, transl = hand_parameters(moment, side, hand.joints)
         pose = pose + angle * rng.normal(size=pose.shape)
         transl = transl + length * rng.normal(size=3)
         arrays = (pose[None], hand.betas, transl[None])

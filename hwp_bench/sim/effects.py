@@ -20,7 +20,7 @@ from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.records import number, parse_record
 from hwp_bench.sim.geometry.noise import generator
 from hwp_bench.sim.geometry.surface import rigid, unit
-from hwp_bench.sim.light.lights import CastShadow, Lights, focus_point, steady_light
+from hwp_bench.sim.light.lights import CastShadow, Lights, steady_light
 from hwp_bench.sim.props.objects import check_object
 from hwp_bench.sim.scene.scene import (
     EffectCall,
@@ -335,7 +335,7 @@ def _moved(lights: Lights, strength: float) -> Lights:
 
     swing = Rotation.from_euler("y", 70.0 * strength, degrees=True)
     direction = swing.apply(lights.direction) + np.array([0.0, 0.25 * strength, 0.0])
-    lamps = tuple(lamp.turned(swing.as_matrix(), focus_point()) for lamp in lights.lamps)
+    lamps = tuple(lamp.turned(swing.as_matrix()) for lamp in lights.lamps)
     return replace(lights, direction=unit(direction), lamps=lamps)
 
 

@@ -24,7 +24,7 @@ from hwp_bench.hands.poses import gestures, within_limits
 from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.sim.geometry.noise import generator
 from hwp_bench.sim.geometry.surface import RenderCost, unit
-from hwp_bench.sim.light.lights import FOCUS_DISTANCE, focus_point
+from hwp_bench.sim.light.lights import FOCUS_DISTANCE
 from hwp_bench.sim.render.frame import eight_bit_coverage, render_view, steady_gain
 from hwp_bench.sim.scene.scene import (
     HandMoment,
@@ -213,7 +213,7 @@ def _surfaces(scene: Scene, hands: Mapping[str, HandMoment]) -> dict[str, np.nda
     """Vertices of the posed hands before they are refined, by side: (T, 3) m each."""
     found = {}
     for side, subject in scene_hands(scene).items():
-        pose, transl = hand_parameters(hands[side], side, subject.joints, focus_point())
+        pose, transl = hand_parameters(hands[side], side, subject.joints)
         found[side] = template_vertices(subject.tensors, pose, subject.betas, transl)
     return found
 

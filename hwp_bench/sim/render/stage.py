@@ -16,6 +16,7 @@ from hwp_bench.sim.geometry.surface import (
     Surface,
     Tracer,
     join,
+    rigid,
     transformed,
     unit,
 )
@@ -145,12 +146,10 @@ class Stage:
 
     def parameters(self, hands: dict[str, HandMoment]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """Pose (16, 3) rad and transl (3,) m of every hand."""
-        focus = focus_point()
+        subjects = scene_hands(self.scene)
         return {
-            side: hand_parameters(moment, side, subject.joints, focus)
-            for (side, moment), subject in zip(
-                hands.items(), scene_hands(self.scene).values(), strict=True
-            )
+            side: hand_parameters(moment, side, subjects[side].joints)
+            for side, moment in hands.items()
         }
 
     def surface(
@@ -231,31 +230,25 @@ class Stage:
         sky = np.clip(np.concatenate([*parts, others]), 0.0, 1.0)
         return replace(surface, openness=sky)
 
-    def things(
-        self, placements: tuple[Placement, ...], hands: dict[str, HandMoment]
-    ) -> Body | None:
+    def things(self, placements: list[Placement], hands: dict[str, HandMoment]) -> Body | None:
         """The objects of an instant, ready for rays, or None."""
         if not placements:
             return None
         with self.cost.time("objects"):
             return self.traced(self.objects(placements, hands))
 
-    def objects(self, placements: tuple[Placement, ...], hands: dict[str, HandMoment]) -> Surface:
+    def objects(self, placements: list[Placement], hands: dict[str, HandMoment]) -> Surface:
         """The objects of an instant, at least one, as one surface."""
         parts = []
         for placement in placements:
-            frame = np.eye(4)
-            frame[:3, 3] = focus_point()
+            frame = rigid(None, focus_point())
             if placement.anchor != "world":
                 moment = hands[placement.anchor]
                 still = heading_matrix(np.zeros(3), placement.anchor)
-                frame[:3, :3] = heading_matrix(moment.heading, placement.anchor) @ still.T
-                frame[:3, 3] += moment.place
-            parts.append(
-                transformed(
-                    build_object(placement.name, placement.variant), frame @ placement.transform
-                )
-            )
+                turn = heading_matrix(moment.heading, placement.anchor) @ still.T
+                frame = rigid(turn, focus_point() + moment.place)
+            thing = build_object(placement.name, placement.variant)
+            parts.append(transformed(thing, frame @ placement.transform))
         return join(parts)
 
 

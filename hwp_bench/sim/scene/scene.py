@@ -8,7 +8,7 @@ renders at any number of frames.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import MISSING, asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -20,15 +20,18 @@ from hwp_bench.base.records import Seed, number
 from hwp_bench.hands.poses import finger_pose, gesture, mirrored, within_limits
 from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.sim.geometry.noise import generator
+from hwp_bench.sim.geometry.surface import ease, rigid
 from hwp_bench.sim.light.lights import Light, focus_point
 from hwp_bench.sim.props.behind import NOTHING, Behind
 from hwp_bench.sim.sensor import NOISELESS, Sensor
 from hwp_bench.sim.subject.hand import FINE, SubjectHand, subject_hand
-from hwp_bench.sim.subject.subject import Subject, Words
+from hwp_bench.sim.subject.subject import Subject, Words, without_defaults
 from hwp_bench.taxonomy import MAX_SEVERITY
 
 #: Version of the scene format; part of every scene digest.
 SCHEMA = "hwp-scene/1"
+#: Share of an episode in which it rises, and in which it falls.
+RAMP = 0.2
 #: Where the clean part of a capture begins, as a fraction: nothing is perturbed from here on.
 CLEAN_FROM = 0.8
 #: Share of the training frames that must stay unperturbed.
@@ -116,6 +119,13 @@ class Episode:
     #: Severity in its middle, 1-5; it rises and falls at the ends.
     severity: float
 
+    def rise(self, moment: float) -> float | None:
+        """How far a moment lies inside of the nearer end, in lengths of `RAMP`; None outside."""
+        if not self.start <= moment <= self.end:
+            return None
+        through = (moment - self.start) / (self.end - self.start)
+        return min(through, 1.0 - through) / RAMP
+
 
 @dataclass(frozen=True)
 class EffectCall:
@@ -187,7 +197,13 @@ class Scene:
             self.sensor, ("noise", "jpeg_quality", "rolling_shutter")
         )
         content["light"] = without_defaults(self.light, ("direction", "key", "sky", "kelvin"))
-        content["subject"] = _subject_json(self.subject)
+        subject = self.subject
+        content["subject"] = without_defaults(subject, ("seed", "tone", "age", "sleeve", "model"))
+        content["subject"].pop("looks", None)
+        if looks := without_defaults(subject.looks):
+            content["subject"]["looks"] = looks
+        if subject.anatomy is not None:
+            content["subject"]["anatomy"] = without_defaults(subject.anatomy)
         track = content["track"]
         content["track"] = {
             "period": track["period"],
@@ -216,14 +232,11 @@ def with_severity(scene: Scene, severity: float) -> Scene:
     """The scene with every episode at one severity."""
     if not 1 <= severity <= MAX_SEVERITY:
         raise UsageError(f"{severity} is not in 1..{MAX_SEVERITY}", field="severity")
-    effects = tuple(
-        replace(
-            call,
-            episodes=tuple(replace(part, severity=float(severity)) for part in call.episodes),
-        )
-        for call in scene.effects
-    )
-    return replace(scene, effects=effects)
+    effects = []
+    for call in scene.effects:
+        episodes = tuple(replace(part, severity=float(severity)) for part in call.episodes)
+        effects.append(replace(call, episodes=episodes))
+    return replace(scene, effects=tuple(effects))
 
 
 def with_subject(scene: Scene, seed: int) -> Scene:
@@ -248,31 +261,6 @@ def with_effects(scene: Scene, kinds: Collection[str]) -> Scene:
     return replace(scene, effects=tuple(call for call in scene.effects if call.kind in kinds))
 
 
-def without_defaults(record: Any, keep: tuple[str, ...]) -> dict[str, Any]:
-    """Return a record as JSON values, without fields that say what they say by default."""
-    content = asdict(record)
-    for item in fields(record):
-        default = item.default
-        if default is MISSING and item.default_factory is not MISSING:
-            default = item.default_factory()
-        if item.name not in keep and getattr(record, item.name) == default:
-            del content[item.name]
-    return content
-
-
-def _subject_json(subject: Subject) -> dict[str, Any]:
-    """A subject as JSON values, without later fields that change nothing."""
-    content = without_defaults(subject, ("seed", "tone", "age", "sleeve", "model"))
-    content.pop("looks", None)
-    if looks := subject.looks.to_json():
-        content["looks"] = looks
-    if subject.anatomy is not None:
-        content["anatomy"] = without_defaults(subject.anatomy, ())
-    return content
-
-
-#: Share of an episode in which it rises, and in which it falls.
-RAMP = 0.2
 #: A level below this rounds to severity 0: the effect is absent.
 ACTIVE_FROM = 0.5
 # Moments at which the share of clean frames is measured.
@@ -281,24 +269,16 @@ _PROBES = 2001
 
 def level(call: EffectCall, moment: float) -> float:
     """How strongly an effect acts at one moment: 0, or from `ACTIVE_FROM` to 5."""
-    strongest = 0.0
-    for episode in call.episodes:
-        if episode.start <= moment <= episode.end:
-            through = (moment - episode.start) / (episode.end - episode.start)
-            rise = min(through, 1.0 - through) / RAMP
-            shape = min(1.0, 0.35 + 0.65 * rise)
-            strongest = max(strongest, shape * episode.severity)
+    rises = ((part.rise(moment), part.severity) for part in call.episodes)
+    levels = (min(1.0, 0.35 + 0.65 * rise) * most for rise, most in rises if rise is not None)
+    strongest = max(levels, default=0.0)
     return strongest if strongest >= ACTIVE_FROM else 0.0
 
 
 def envelope(call: EffectCall, moment: float) -> float:
     """How far into an episode a moment is: 0 at its ends, 1 from `RAMP` on, smooth between."""
-    for episode in call.episodes:
-        if episode.start <= moment <= episode.end:
-            through = (moment - episode.start) / (episode.end - episode.start)
-            x = min(1.0, min(through, 1.0 - through) / RAMP)
-            return x * x * (3.0 - 2.0 * x)
-    return 0.0
+    rises = (part.rise(moment) for part in call.episodes)
+    return float(ease(next((rise for rise in rises if rise is not None), 0.0)))
 
 
 def severity(call: EffectCall, moment: float) -> int:
@@ -354,12 +334,6 @@ def moment_of_key(key: HandKey) -> HandMoment:
     )
 
 
-def smoothstep(x: float) -> float:
-    """Ease from 0 to 1 with zero speed and acceleration at both ends (6x^5 - 15x^4 + 10x^3)."""
-    x = min(max(x, 0.0), 1.0)
-    return x * x * x * (x * (6.0 * x - 15.0) + 10.0)
-
-
 def along_keys(
     keys: list[HandMoment], phase: float, scene: Scene, label: str, variation: float
 ) -> HandMoment:
@@ -367,19 +341,16 @@ def along_keys(
     index = int(np.floor(phase))
     before = _varied(keys[index % len(keys)], scene, label, index, variation)
     after = _varied(keys[(index + 1) % len(keys)], scene, label, index + 1, variation)
-    through = (phase - index - _DWELL / 2) / (1.0 - _DWELL)
-    return before.blend(after, smoothstep(through))
+    x = min(max((phase - index - _DWELL / 2) / (1.0 - _DWELL), 0.0), 1.0)
+    # Zero speed and acceleration at both ends: 6x^5 - 15x^4 + 10x^3.
+    return before.blend(after, x * x * x * (x * (6.0 * x - 15.0) + 10.0))
 
 
 def _varied(key: HandMoment, scene: Scene, label: str, index: int, variation: float) -> HandMoment:
     rng = generator(scene.seed, "key", label, index)
     angles = key.angles + rng.normal(0.0, variation, key.angles.shape)
-    return replace(
-        key,
-        angles=angles,
-        place=key.place + rng.normal(0.0, 0.004, 3),
-        heading=key.heading + rng.normal(0.0, variation, 3),
-    )
+    place = key.place + rng.normal(0.0, 0.004, 3)
+    return HandMoment(angles, place, key.heading + rng.normal(0.0, variation, 3))
 
 
 def track_moment(scene: Scene, side: str, seconds: float) -> HandMoment:
@@ -390,8 +361,7 @@ def track_moment(scene: Scene, side: str, seconds: float) -> HandMoment:
     rng = generator(scene.seed, "wander", side)
     rates = rng.uniform(0.5, 1.4, 6)
     waves = np.sin(rates * seconds * 2.0 + rng.uniform(0.0, 2.0 * np.pi, 6))
-    return replace(
-        moment,
+    return HandMoment(
         angles=within_limits(moment.angles),
         place=moment.place + _WANDER_PLACE * waves[:3],
         heading=moment.heading + _WANDER_ANGLE * waves[3:],
@@ -419,12 +389,11 @@ def palm_of(joints: np.ndarray) -> np.ndarray:
 
 
 def hand_parameters(
-    moment: HandMoment, side: str, joints: np.ndarray, focus: np.ndarray
+    moment: HandMoment, side: str, joints: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Turn a moment into the hand model's pose, (16, 3) axis-angle rad, and translation, (3,) m.
 
-    Takes `joints` (16, 3) rest joints of that side with the subject's shape, `focus` (3,) the point
-    that places are relative to.
+    Takes `joints` (16, 3) rest joints of that side with the subject's shape.
     """
     from scipy.spatial.transform import Rotation
 
@@ -434,7 +403,7 @@ def hand_parameters(
         fingers = mirrored(fingers)
     turn = heading_matrix(moment.heading, side)
     palm = palm_of(joints)
-    transl = focus + moment.place - joints[0] - turn @ (palm - joints[0])
+    transl = focus_point() + moment.place - joints[0] - turn @ (palm - joints[0])
     return np.vstack([Rotation.from_matrix(turn).as_rotvec(), fingers]), transl
 
 
@@ -460,12 +429,9 @@ def viewmat(scene: Scene, seconds: float) -> np.ndarray:
     phases = rng.uniform(0.0, 2.0 * np.pi, (2, 6))
     waves = np.sin(rates * seconds + phases)
     waves = 0.7 * waves[0] + 0.3 * waves[1]
-    view = np.eye(4)
-    view[:3, :3] = Rotation.from_rotvec(0.012 * waves[:3]).as_matrix()
+    turn, focus = Rotation.from_rotvec(0.012 * waves[:3]).as_matrix(), focus_point()
     # The camera sways around the point that it looks at.
-    focus = focus_point()
-    view[:3, 3] = focus - view[:3, :3] @ focus - scene.camera.sway * waves[3:]
-    return view
+    return rigid(turn, focus - turn @ focus - scene.camera.sway * waves[3:])
 
 
 def pixel_rays(
@@ -500,11 +466,7 @@ def parameters_of(
         if betas is not None:
             shape = betas[side]
             joints = subject.model.joints + subject.model.joint_basis @ shape
-        rows = [hand_parameters(hands[side], side, joints, focus_point()) for hands in moments]
-        found[side] = HandParameters(
-            pose=np.stack([pose for pose, _ in rows]),
-            betas=shape,
-            transl=np.stack([transl for _, transl in rows]),
-            valid=np.ones(len(moments), dtype=bool),
-        )
+        rows = [hand_parameters(hands[side], side, joints) for hands in moments]
+        pose, transl = (np.stack(parts) for parts in zip(*rows, strict=True))
+        found[side] = HandParameters(pose, shape, transl, np.ones(len(moments), dtype=bool))
     return found

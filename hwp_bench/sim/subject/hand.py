@@ -44,7 +44,7 @@ from hwp_bench.sim.hand.anatomy import (
     off_template,
 )
 from hwp_bench.sim.hand.rigs import load_rig, rig_path
-from hwp_bench.sim.subject.subject import PLAIN, Subject
+from hwp_bench.sim.subject.subject import PLAIN, Subject, without_defaults
 from hwp_bench.sim.subject.wear import SkinSample, _polished, gloved, tattoo_cover
 
 if TYPE_CHECKING:
@@ -601,7 +601,7 @@ def kept(
 ) -> SkinAtlas:
     """Read a painting from the cache, or paint it and keep it where the cache can be written."""
     person: list[Any] = [subject.seed, subject.tone, subject.age]
-    looks = replace(subject.looks, rings=(), wrist=()).to_json()
+    looks = without_defaults(replace(subject.looks, rings=(), wrist=()))
     if looks:
         person.append([LOOKS_VERSION, looks])
     if part:

@@ -22,7 +22,6 @@ from hwp_bench.hands import HandTemplate, load_template
 from hwp_bench.hands.skeleton import PARENTS
 from hwp_bench.sim.hand.anatomy import SubjectAnatomy, off_template, resized, reweighted
 from hwp_bench.sim.hand.rigs import outlines
-from hwp_bench.sim.light.lights import focus_point
 from hwp_bench.sim.produce.capture import render_capture
 from hwp_bench.sim.produce.truth import distances, subject_table, template_distance
 from hwp_bench.sim.scene.scene import HandKey, Scene, hand_parameters, moment_of_key
@@ -109,7 +108,7 @@ def test_every_anatomy_can_be_posed(anatomy: SubjectAnatomy) -> None:
     hand = subject_hand(replace(SUBJECT, anatomy=anatomy), "right", MOVING)
     for gesture in ("open", "fist"):
         moment = moment_of_key(HandKey(gesture))
-        vertices, normals = hand.pose(*hand_parameters(moment, "right", hand.joints, focus_point()))
+        vertices, normals = hand.pose(*hand_parameters(moment, "right", hand.joints))
         assert np.isfinite(vertices).all()
         np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-9)
         assert np.ptp(vertices, axis=0).max() < 0.32
@@ -219,9 +218,7 @@ def test_nails_stand_out_and_turn_with_the_finger(plain: SubjectHand) -> None:
     bare = replace(hand, nails=None)
     tips, joints = plain.template.fingertips, (15, 3, 6, 12, 9)
     for key in ("open", "fist"):
-        pose, place = hand_parameters(
-            moment_of_key(HandKey(key)), "right", hand.joints, focus_point()
-        )
+        pose, place = hand_parameters(moment_of_key(HandKey(key)), "right", hand.joints)
         with_nails, without = hand.pose(pose, place)[0], bare.pose(pose, place)[0]
         way = np.linalg.norm(with_nails - without, axis=1)
         assert (way > 1e-9).sum() == len(hand.nails.rows) < 0.05 * len(way)

@@ -17,7 +17,6 @@ from hwp_bench.sim.hand.rigs import WEBXR, load_rig, rig_path
 from hwp_bench.sim.render.frame import render_frame
 from hwp_bench.sim.scene.scene import Scene
 
-
 #: The joints as OpenXR rigs name them, without the side's suffix.
 OPENXR = (
     "Wrist",

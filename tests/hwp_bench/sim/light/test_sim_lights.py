@@ -83,7 +83,7 @@ def test_a_small_lamp_follows_the_inverse_square(
     place: tuple[float, float, float], ahead: float
 ) -> None:
     # Oracle: strength (d0 / d)^2 on a surface that faces the lamp; a lamp of 5 mm is a point.
-    lamp = area_light(Lamp(place=place, strength=0.8, width=0.005), focus_point())
+    lamp = area_light(Lamp(place=place, strength=0.8, width=0.005))
     way = np.array(place) / np.linalg.norm(place)
     points = focus_point() + ahead * way[None]
     lights = _dark(lamps=(lamp,), exposure=2.0)
@@ -95,7 +95,7 @@ def test_a_small_lamp_follows_the_inverse_square(
 
 def test_a_window_is_the_integral_over_its_area() -> None:
     # Oracle: the four samples of a pixel against 200 x 200 points of the same rectangle.
-    lamp = area_light(Lamp(place=(-0.8, 0.0, -0.3), strength=1.0, width=1.2), focus_point())
+    lamp = area_light(Lamp(place=(-0.8, 0.0, -0.3), strength=1.0, width=1.2))
     normal = np.array([-0.5, -0.7, -0.5]) / np.linalg.norm([0.5, 0.7, 0.5])
     points = np.repeat(focus_point()[None] + [[0.03, 0.02, 0.0]], 4, axis=0)
     lights = _dark(lamps=(lamp,))
@@ -131,7 +131,7 @@ def test_small_lamps_throw_hard_shadows_and_windows_soft_ones() -> None:
     normals = np.tile([0.0, 0.0, -1.0], (len(across), 1))
     for width in (0.01, 0.1, 0.5):
         lamp = Lamp(place=(0.0, 0.0, -distance), strength=1.0, width=width)
-        lights = _dark(lamps=(area_light(lamp, focus_point()),))
+        lights = _dark(lamps=(area_light(lamp),))
         light = sum(
             lamp_light(
                 _samples(points, normals), lights, [_tracer(edge)], np.full(len(across), turn)
@@ -265,9 +265,7 @@ def _walls(depths: tuple[float, ...]) -> Surface:
 @pytest.mark.parametrize("thickness", [0.002, 0.006])
 def test_light_passes_through_thin_skin_and_reddens(thickness: float) -> None:
     # Oracle: Beer and Lambert on a slab. The ray starts twice its lift inside the skin.
-    lamp = area_light(
-        Lamp(place=(0.0, 0.0, 0.6), strength=1.0, width=0.01, through=1.0), focus_point()
-    )
+    lamp = area_light(Lamp(place=(0.0, 0.0, 0.6), strength=1.0, width=0.01, through=1.0))
     facing = np.array([[0.0, 0.0, -1.0]])
     samples = _samples(focus_point()[None], facing)
     slab = _tracer(_walls((0.0, thickness)))

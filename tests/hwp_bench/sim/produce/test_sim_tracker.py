@@ -15,7 +15,6 @@ from hwp_bench.base.errors import BadInput
 from hwp_bench.hands import load_template
 from hwp_bench.hands.poses import RestSkeleton, posed_skeleton, rest_skeleton, turned
 from hwp_bench.sim.effects import plan_frame
-from hwp_bench.sim.light.lights import focus_point
 from hwp_bench.sim.produce.capture import true_hands
 from hwp_bench.sim.produce.estimates import (
     MEMORY,
@@ -56,7 +55,7 @@ def _held(count: int, gesture: str, turn: float = 180.0) -> tuple[np.ndarray, np
         turn: about the fingers' direction, degrees; 180 shows the palm.
     """
     moment = moment_of_key(HandKey(gesture, turn=turn))
-    pose, transl = hand_parameters(moment, "right", _hand().joints, focus_point())
+    pose, transl = hand_parameters(moment, "right", _hand().joints)
     return np.tile(pose, (count, 1, 1)), np.tile(transl, (count, 1))
 
 
