@@ -7,11 +7,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from hwp_bench.base.colors import srgb_to_linear
 from hwp_bench.sim.effects import Placement
 from hwp_bench.sim.geometry.surface import (
     Hits,
-    Material,
     RenderCost,
     Surface,
     Tracer,
@@ -44,26 +42,14 @@ from hwp_bench.sim.subject.arms import (
     wrist_mounts,
     wrist_rim,
 )
-from hwp_bench.sim.subject.hand import FINE, SkinAtlas, of_side, skin_atlas, subject_hand
+from hwp_bench.sim.subject.hand import FINE, of_side, skin_atlas, subject_hand
 from hwp_bench.sim.subject.subject import Subject
 from hwp_bench.sim.subject.wear import covered
 
-# How far light wraps around the terminator inside skin, per linear channel.
-_WRAP = (0.28, 0.12, 0.07)
 # Place of the right elbow, m from the point looked at.
 _ELBOW = np.array([0.10, 0.42, 0.02])
 #: Who owns a part of the image: a hand, or nothing that counts as one.
 OWNERS = {"right": 1, "left": 2, "": 3}
-
-
-@dataclass(frozen=True, eq=False)
-class Part:
-    """A piece of a person."""
-
-    #: The hand that it counts as, or empty.
-    side: str
-    #: The piece, posed.
-    surface: Surface
 
 
 def _hand_surface(
@@ -72,7 +58,9 @@ def _hand_surface(
     """A posed hand: `pose` (16, 3) rad, `transl` (3,) m."""
     hand = subject_hand(subject, side, subdivisions)
     vertices, normals = hand.pose(pose, transl)
-    skin = _skin(subject, side)
+    skin = hand.own_skin
+    if skin is None:
+        skin = skin_atlas(of_side(subject, side))
     surface = Surface(
         vertices=vertices,
         normals=normals,
@@ -82,7 +70,7 @@ def _hand_surface(
         materials=(skin,),
         hand=np.ones(len(hand.faces), dtype=bool),
     )
-    if hand.texture is not None or not of_side(subject, side).looks.gloves:
+    if hand.own_skin is not None or not of_side(subject, side).looks.gloves:
         return surface
     # Light does not wrap around the terminator inside cloth.
     cloth = replace(skin, wrap=(0.0, 0.0, 0.0), specular=0.02)
@@ -97,34 +85,6 @@ def _gloved_faces(subject: Subject, side: str, subdivisions: int) -> np.ndarray:
     anatomy = hand.anatomy(hand.rest, hand.rest_normals, hand.lift @ hand.template.weights)
     glove = of_side(subject, side).looks.gloves[0]
     return (covered(anatomy, glove)[hand.faces].mean(axis=1) > 0.5).astype(np.int64)
-
-
-@lru_cache(maxsize=4)
-def _skin(subject: Subject, side: str) -> Material:
-    texture = subject_hand(subject, side).texture
-    if texture is not None:
-        return Material(
-            albedo=srgb_to_linear(texture / 255.0).astype(np.float32),
-            gloss=0.55,
-            specular=0.028,
-            wrap=_WRAP,
-        )
-    return _painted_skin(skin_atlas(of_side(subject, side)))
-
-
-@lru_cache(maxsize=4)
-def _arm_skin(subject: Subject) -> Material:
-    return _painted_skin(arm_atlas(subject))
-
-
-def _painted_skin(atlas: SkinAtlas) -> Material:
-    return Material(
-        albedo=atlas.albedo,
-        roughness=atlas.roughness,
-        specular=0.028,
-        height=atlas.height,
-        wrap=_WRAP,
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,22 +119,23 @@ class Stage:
         parameters: dict[str, tuple[np.ndarray, np.ndarray]] | None = None,
     ) -> Surface:
         """Hands, sleeves and what is worn, posed."""
-        return join([part.surface for part in self._parts(hands, subdivisions, parameters)])
+        return join([part for _, part in self._parts(hands, subdivisions, parameters)])
 
     def owners(self, hands: dict[str, HandMoment]) -> np.ndarray:
         """Who owns each face of `surface(hands)`, as `OWNERS` numbers them: (F,)."""
         parts = self._parts(hands, FINE, None)
-        return np.concatenate(
-            [np.full(len(part.surface.faces), OWNERS[part.side]) for part in parts]
-        )
+        return np.concatenate([np.full(len(part.faces), OWNERS[side]) for side, part in parts])
 
     def _parts(
         self,
         hands: dict[str, HandMoment],
         subdivisions: int,
         parameters: dict[str, tuple[np.ndarray, np.ndarray]] | None,
-    ) -> list[Part]:
-        """First the hands, then a sleeve or an arm for each, then what is worn."""
+    ) -> list[tuple[str, Surface]]:
+        """First the hands, then a sleeve or an arm for each, then what is worn.
+
+        Each with the hand that it counts as, or an empty name.
+        """
         subject = self.scene.subject
         parameters = parameters or self.parameters(hands)
         skins, arms, worn = [], [], []
@@ -185,20 +146,20 @@ class Stage:
             elbow = focus_point() + _ELBOW * np.array([mirror, 1.0, 1.0])
             if subject.looks.arm == "bare":
                 rim = wrist_loop(subject, side, subdivisions)
-                paint = _arm_skin(of_side(subject, side))
+                paint = arm_atlas(of_side(subject, side))
                 arm = forearm(skin.vertices[rim.loop], rim.around, forward, elbow, paint)
                 skin, arm = seamless(skin, arm, rim.loop)
             else:
                 cloth = sleeve_material(subject.sleeve, subject.seed)
                 loop = wrist_rim(subject_hand(subject, side, subdivisions).template)
                 arm = sleeve(skin.vertices[loop], forward, elbow, cloth)
-            skins.append(Part(side, skin))
-            arms.append(Part("", arm))
+            skins.append((side, skin))
+            arms.append(("", arm))
             for item in ring_mounts(subject, side):
-                worn.append(Part(side, item.carried(skin.vertices)))
+                worn.append((side, item.carried(skin.vertices)))
             for item in wrist_mounts(subject, side, subdivisions):
                 carrier = arm if item.on_arm else skin
-                worn.append(Part("", item.carried(carrier.vertices)))
+                worn.append(("", item.carried(carrier.vertices)))
         return skins + arms + worn
 
     def traced(self, surface: Surface) -> Body:

@@ -33,11 +33,11 @@ from hwp_bench.sim.geometry.surface import (
 )
 from hwp_bench.sim.subject.hand import (
     FINE,
-    SkinAtlas,
     SubjectHand,
     kept,
     of_side,
     painted,
+    skin_material,
     subject_hand,
 )
 from hwp_bench.sim.subject.subject import Subject
@@ -235,12 +235,12 @@ def rest_arm(subject: Subject, side: str, subdivisions: int = FINE) -> np.ndarra
     return _arm_rings(rim, forward, rim.mean(axis=0) - forward)
 
 
-@lru_cache(maxsize=2)
-def arm_atlas(subject: Subject) -> SkinAtlas:
+@lru_cache(maxsize=4)
+def arm_atlas(subject: Subject) -> Material:
     """Paint the forearm of a subject, or read it from the cache."""
     hand = subject_hand(subject, "right")
 
-    def paint() -> SkinAtlas:
+    def paint() -> Material:
         rim = wrist_loop(subject, "right")
         vertices = rest_arm(subject, "right")
         arm = forearm(
@@ -256,11 +256,8 @@ def arm_atlas(subject: Subject) -> SkinAtlas:
         weights[:, 0] = 1.0
         anatomy = hand.anatomy(points, normals, weights)
         skin = painted(anatomy, of_side(subject, "right"), fine=True)
-        albedo, height, roughness = (
-            np.ascontiguousarray(values.reshape(*_ARM_TEXELS, *values.shape[1:]), dtype=np.float32)
-            for values in (skin.albedo, skin.height, skin.roughness)
-        )
-        return SkinAtlas(albedo, height, roughness)
+        parts = (skin.albedo, skin.height, skin.roughness)
+        return skin_material(*(part.reshape(*_ARM_TEXELS, *part.shape[1:]) for part in parts))
 
     return kept(hand, subject, f"arm {_ARM_TEXELS}", paint)
 

@@ -28,7 +28,9 @@ from hwp_bench.hands.poses import FIRST_JOINT
 from hwp_bench.hands.skeleton import FINGERS, PARENTS, SHAPE_COUNT
 from hwp_bench.sim.geometry.noise import fractal_noise, generator
 from hwp_bench.sim.geometry.surface import (
+    Material,
     Tracer,
+    albedo,
     normal_operator,
     smoothing,
     subdivision,
@@ -437,8 +439,8 @@ class SubjectHand:
     normal_sum: csr_matrix
     #: (V,) m along the normal that no parameter explains.
     relief: np.ndarray
-    #: Colour of the rig, (H, W, 3) uint8 sRGB, or None to paint skin.
-    texture: np.ndarray | None
+    #: Skin of a rig with a texture, or None to paint skin.
+    own_skin: Material | None
     #: Nails that stand out, or None.
     nails: Nails | None = None
 
@@ -519,6 +521,9 @@ def subject_hand(subject: Subject, side: str, subdivisions: int = FINE) -> Subje
     import torch
 
     template, model, betas, joints, texture = person(subject, side)
+    own_skin = None
+    if texture is not None:
+        own_skin = Material(albedo(texture), gloss=0.55, specular=_GLOSS, wrap=_WRAP)
     faces = template.faces
     corner_uv = template.uv[template.face_uv]
     lift = None
@@ -546,11 +551,11 @@ def subject_hand(subject: Subject, side: str, subdivisions: int = FINE) -> Subje
         corner_uv=corner_uv,
         normal_sum=normal_operator(faces, count),
         relief=np.zeros(count),
-        texture=texture,
+        own_skin=own_skin,
     )
     places = hand.anatomy(hand.rest, hand.rest_normals, lift @ template.weights)
     # A rig with a texture of its own keeps it, and so its bare surface.
-    paint = of_side(subject, side) if texture is None else replace(subject, looks=PLAIN)
+    paint = of_side(subject, side) if own_skin is None else replace(subject, looks=PLAIN)
     relief, nails = painted(places, paint, fine=False).height, None
     anatomy = subject_anatomy(subject)
     if anatomy is not None:
@@ -571,34 +576,29 @@ def _subdivide_corners(corners: np.ndarray) -> np.ndarray:
 
 #: Edge of the skin atlas in texels; about 0.25 mm of skin each.
 ATLAS = 1024
+# Reflectance of skin at normal incidence, and how far light wraps around the terminator inside it,
+# per linear channel.
+_GLOSS, _WRAP = 0.028, (0.28, 0.12, 0.07)
 #: Version of the skin painting; part of the cache key.
 SKIN_VERSION = 3
 #: Version of what looks add to it; part of the key where a subject has looks.
 LOOKS_VERSION = 1
 
 
-@dataclass(frozen=True, eq=False)
-class SkinAtlas:
-    """Skin of one subject as textures, row 0 at the top (v = 1)."""
-
-    #: (ATLAS, ATLAS, 3) float32, linear reflectance.
-    albedo: np.ndarray
-    #: (ATLAS, ATLAS) float32, m.
-    height: np.ndarray
-    #: (ATLAS, ATLAS) float32, 0-1.
-    roughness: np.ndarray
+def skin_material(albedo: np.ndarray, height: np.ndarray, roughness: np.ndarray) -> Material:
+    """Painted skin, each (H, W) or (H, W, 3), as a material."""
+    layers = [np.ascontiguousarray(part, dtype=np.float32) for part in (albedo, height, roughness)]
+    return Material(layers[0], height=layers[1], roughness=layers[2], specular=_GLOSS, wrap=_WRAP)
 
 
-@lru_cache(maxsize=2)
-def skin_atlas(subject: Subject) -> SkinAtlas:
+@lru_cache(maxsize=4)
+def skin_atlas(subject: Subject) -> Material:
     """Paint a subject's skin, or read it from the cache. Both hands share it, mirrored."""
     hand = subject_hand(subject, "right")
     return kept(hand, subject, "", lambda: painted_atlas(hand, subject, ATLAS))
 
 
-def kept(
-    hand: SubjectHand, subject: Subject, part: str, paint: Callable[[], SkinAtlas]
-) -> SkinAtlas:
+def kept(hand: SubjectHand, subject: Subject, part: str, paint: Callable[[], Material]) -> Material:
     """Read a painting from the cache, or paint it and keep it where the cache can be written."""
     person: list[Any] = [subject.seed, subject.tone, subject.age]
     looks = without_defaults(replace(subject.looks, rings=(), wrist=()))
@@ -614,7 +614,7 @@ def kept(
     if path.exists():
         try:
             arrays = read_npz(path)
-            return SkinAtlas(*(arrays[name] for name in ("albedo", "height", "roughness")))
+            return skin_material(*(arrays[name] for name in ("albedo", "height", "roughness")))
         except (BadInput, KeyError):
             with contextlib.suppress(OSError):
                 path.unlink(missing_ok=True)
@@ -627,7 +627,7 @@ def kept(
     return atlas
 
 
-def painted_atlas(hand: SubjectHand, subject: Subject, edge: int) -> SkinAtlas:
+def painted_atlas(hand: SubjectHand, subject: Subject, edge: int) -> Material:
     """Paint the skin of a hand; nothing is kept."""
     from scipy.ndimage import distance_transform_edt
 
@@ -655,8 +655,4 @@ def painted_atlas(hand: SubjectHand, subject: Subject, edge: int) -> SkinAtlas:
         empty.reshape(edge, edge), return_distances=False, return_indices=True
     )
     layers = layers.reshape(edge, edge, 5)[nearest[0], nearest[1]]
-    return SkinAtlas(
-        np.ascontiguousarray(layers[..., :3]),
-        np.ascontiguousarray(layers[..., 3]),
-        np.ascontiguousarray(layers[..., 4]),
-    )
+    return skin_material(layers[..., :3], layers[..., 3], layers[..., 4])
