@@ -11,6 +11,7 @@ import argparse
 import time
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -81,8 +82,9 @@ def _rays_ratio(size: int) -> float:
     view = viewmat(scene, 0.0)
     origin, directions = pixel_rays(intrinsics(scene, size), view, (0, size, 0, size), 1)
     best = [np.inf, np.inf]
+    meshes: tuple[Any, Any] = (partial(EmbreeMesh, loaded), EmbreexMesh)
     for _ in range(5):
-        for way, mesh in enumerate((partial(EmbreeMesh, loaded), EmbreexMesh)):
+        for way, mesh in enumerate(meshes):
             start = time.process_time()
             mesh(surface.vertices, surface.faces).first_hits(
                 origin[None], directions.reshape(-1, 3)

@@ -31,7 +31,7 @@ BUDGET = 20.0
 REFERENCE = "reference: sort, argsort, median"
 
 
-class Listener(event.Listener):  # type: ignore[misc]
+class Listener(event.Listener):
     """Processor seconds of every version that this process compiles, by kernel."""
 
     def __init__(self) -> None:

@@ -14,6 +14,7 @@ import dataclasses
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -30,7 +31,7 @@ FADED = 1e-35
 #: Weights of the loss that are settings.
 SETTINGS = {"terms.surface": 5e-4}
 #: Those of DPD that are constants.
-CONSTANTS = {"gain_weight": 0.1, "tint_weight": 1.0, "omega_weight": 1.0}
+CONSTANTS: dict[str, Any] = {"gain_weight": 0.1, "tint_weight": 1.0, "omega_weight": 1.0}
 #: Those of the other terms.
 FADED_WEIGHTS = {
     "ours": terms.TermWeights(
@@ -44,7 +45,7 @@ def processor_ms(
 ) -> dict[tuple[str, bool], float]:
     """Median processor milliseconds of a step by fit (ordinary, faded) and flushing."""
     torch.set_num_threads(threads)
-    settings = {
+    settings: dict[str, dict[str, Any]] = {
         "ordinary": {"gaussians": gaussians},
         "faded": {"gaussians": gaussians} | {name: FADED * w for name, w in SETTINGS.items()},
     }
@@ -54,7 +55,9 @@ def processor_ms(
         for turn in range(rounds + 1):
             for name, loop in loops.items():
                 faded = FADED if name == "faded" else 1.0
-                constants = {constant: faded * weight for constant, weight in CONSTANTS.items()}
+                constants: dict[str, Any] = {
+                    constant: faded * weight for constant, weight in CONSTANTS.items()
+                }
                 weights = FADED_WEIGHTS if name == "faded" else terms.WEIGHTS
                 for flush in (True, False):
                     with (

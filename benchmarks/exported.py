@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -101,16 +102,18 @@ def _draw_splats(path: Path, place: Place, camera: Camera) -> np.ndarray:
     basis = sh_basis(directions @ turn, int(np.sqrt(harmonics.shape[2])) - 1)
     colors = (0.5 + np.einsum("nk,nck->nc", basis, harmonics)).clip(min=0.0)
     opacities = 1.0 / (1.0 + np.exp(-column["opacity"]))
-    image, _, _ = rasterize(
-        *(
-            torch.as_tensor(np.ascontiguousarray(each), dtype=torch.float32)
-            for each in (means, quats, np.exp(stacked("scale_{}", 3)), opacities, colors)
-        ),
-        torch.as_tensor(camera.viewmat, dtype=torch.float32)[None],
-        torch.as_tensor(camera.K, dtype=torch.float32)[None],
-        camera.width,
-        camera.height,
-    )
+    tensors: dict[str, Any] = {
+        "means": means,
+        "quats": quats,
+        "scales": np.exp(stacked("scale_{}", 3)),
+        "opacities": opacities,
+        "colors": colors,
+        "viewmats": camera.viewmat[None],
+        "Ks": camera.K[None],
+    }
+    for name, values in tensors.items():
+        tensors[name] = torch.as_tensor(np.ascontiguousarray(values), dtype=torch.float32)
+    image, _, _ = rasterize(**tensors, width=camera.width, height=camera.height)
     return image[0].clamp(0.0, 1.0).numpy()
 
 

@@ -115,7 +115,7 @@ def _json(data: bytes, chance: random.Random) -> tuple[bytes, str]:
     place = chance.choice(_places(value[""]))
     holder, key = value, ""
     for step in place:
-        holder, key = holder[key], step  # type: ignore[assignment]
+        holder, key = holder[key], step
     raw = chance.choice(JSON_VALUES)
     way = chance.choice(("value", "value", "value", "value", "missing", "more", "name", "repeat"))
     name = ".".join(map(str, place)) or "all"
@@ -135,7 +135,7 @@ def _json(data: bytes, chance: random.Random) -> tuple[bytes, str]:
         raw = ""
     else:
         way = "value"
-        holder[key] = _MARK  # type: ignore[assignment]
+        holder[key] = _MARK
     text = json.dumps(value[""]).replace(f'"{_MARK}"', raw)
     return text.encode(), f"{way} of {name} {raw[:40]}"
 
@@ -195,12 +195,12 @@ def _npz(data: bytes, chance: random.Random) -> tuple[bytes, str]:
     stream = io.BytesIO()
     if way < 0.75 and arrays[name].size:
         arrays[name], how = _array(arrays[name], chance)
-        np.savez(stream, **arrays)  # type: ignore[arg-type]
+        np.savez(stream, **arrays)
         return stream.getvalue(), f"{name}: {how}"
     if way < 0.85:
         del arrays[name]
         arrays[chance.choice(("extra", "\x1b[2J", "a/../b"))] = np.zeros(3)
-        np.savez(stream, **arrays)  # type: ignore[arg-type]
+        np.savez(stream, **arrays)
         return stream.getvalue(), f"{name} has another name"
     # A header that claims more, or says what numpy's parser of headers does not expect.
     claims = (

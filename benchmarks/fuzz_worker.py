@@ -66,10 +66,10 @@ def run_forked(
         time.sleep(0.002)
     _kill_group(child)  # what it left behind
     code = os.waitstatus_to_exitcode(status)
-    texts = [(folder / name).read_bytes() for name in (".out", ".err")]
+    out, err = ((folder / name).read_bytes() for name in (".out", ".err"))
     for name in (".out", ".err"):
         (folder / name).unlink()
-    return Ended(code, *texts, usage.ru_utime + usage.ru_stime)
+    return Ended(code, out, err, usage.ru_utime + usage.ru_stime)
 
 
 def _kill_group(child: int) -> None:

@@ -28,7 +28,6 @@ from hwp_bench.methods.contract import TrainingCapture
 from hwp_bench.methods.manifest import find_method, read_manifest
 from wildghand.fitting.components import make_fit
 from wildghand.fitting.method import ready_fit
-from wildghand.gaussians.fit_loop import batches
 from wildghand.model.settings import read_settings
 from wildghand.splat.threads import denormals_flushed
 
@@ -86,7 +85,7 @@ class Loop:
         chosen = read_settings(dict(settings))
         self.device = ready_fit(chosen.device)
         self._fit = make_fit(training, chosen, 0, self.device)
-        self._order = batches(len(self._fit.frames), chosen.schedule.batch, 0)
+        self._order = self._fit.batches()
 
     def block(self, steps: int = BLOCK) -> float:
         """Take steps; returns the seconds of one."""

@@ -117,7 +117,7 @@ def measure(size: str = "compact", count: int = 5_000, rounds: int = 12) -> Mapp
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        network = float(time_network(size, count, rounds).rows[0][-1])
+        network = float(str(time_network(size, count, rounds).rows[0][-1]))
         drawn = race([Drawing("one", ours("numba"))], make(count, 176), rounds)["one"]
         fastest = 1e3 * min(processor for *_, processor in drawn.rows)
         return {"network / rasterizer": network / fastest}

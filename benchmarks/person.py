@@ -14,6 +14,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import cv2
@@ -59,7 +60,7 @@ class Person:
     #: What the model's right hand lacks of the person's.
     truth: SubjectShape
 
-    def shape(self, spreads: Mapping[str, float], validation: bool) -> tuple[SubjectShape, float]:
+    def shape(self, spreads: Mapping[str, Any], validation: bool) -> tuple[SubjectShape, float]:
         """The shape that a fit finds, and its seconds."""
         data, settings = FitData(self.training, torch.device("cpu")), read_settings({}).subject
         judges = data.judges if validation else None

@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.files import read_json, write_json
@@ -22,7 +22,7 @@ STORE = Path(__file__).with_name("ratios.json")
 #: units differ, so that ratios do too.
 ELSEWHERE = 3.0
 #: Its format.
-SCHEMA = "hwp-ratios/1"
+SCHEMA: Final = "hwp-ratios/1"
 
 
 @dataclass(frozen=True)

@@ -65,7 +65,7 @@ class Times:
 
 
 def ours(backend: str) -> Draw:
-    def draw(tensors: dict[str, torch.Tensor], size: int) -> torch.Tensor:
+    def draw(tensors: dict[str, Any], size: int) -> torch.Tensor:
         return rasterize(**tensors, width=size, height=size, backend=backend)[0]
 
     return draw

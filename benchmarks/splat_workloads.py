@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -33,7 +34,7 @@ FINGERS = (
 class Workload:
     """Arguments of one call of `rasterize`, float32, one camera."""
 
-    arguments: dict[str, torch.Tensor]
+    arguments: dict[str, Any]
     size: int
 
     def views(self, count: int) -> dict[str, torch.Tensor]:

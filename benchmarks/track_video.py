@@ -14,6 +14,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -104,7 +105,7 @@ def runtimes() -> dict[str, float]:
         image = rng.integers(0, 256, (edge, edge, 3), dtype=np.uint8)
         net = cv2.dnn.readNetFromTFLite(np.frombuffer(content, np.uint8))
         net.setInput(cv2.dnn.blobFromImage(image, 1 / 255))
-        found[f"{name}, LiteRT"] = _milliseconds(lambda call=call, image=image: call(image))
+        found[f"{name}, LiteRT"] = _milliseconds(partial(call, image))
         found[f"{name}, OpenCV"] = _milliseconds(net.forward)
     return found
 

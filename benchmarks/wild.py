@@ -11,6 +11,7 @@ import argparse
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -66,7 +67,9 @@ def capture_table(scenes: Sequence[Scene]) -> Table:
 
 def disjoint_table(found: Mapping[str, Sequence[Scene]]) -> Table:
     """How many different parts each set of scenes has, and what pairs of sets share."""
-    rows = [(name, *(counts(scenes)[kind] for kind in KINDS)) for name, scenes in found.items()]
+    rows: list[tuple[Any, ...]] = [
+        (name, *(counts(scenes)[kind] for kind in KINDS)) for name, scenes in found.items()
+    ]
     for first, second in itertools.combinations(found, 2):
         lines = shared(found[first], found[second])
         common = [sum(line.startswith(f"{kind} ") for line in lines) for kind in KINDS]
