@@ -367,7 +367,8 @@ def _weights(
     file: _Gltf, attributes: Any, count: int, joint_count: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Joints and weights of every vertex, all sets side by side: (V, 4 K) each."""
-    joints, values = [], []
+    joints: list[np.ndarray] = []
+    values: list[np.ndarray] = []
     while not joints or getattr(attributes, f"JOINTS_{len(joints)}", None) is not None:
         number = len(joints)
         joints.append(file.array(getattr(attributes, f"JOINTS_{number}", None)).astype(np.int64))

@@ -576,6 +576,8 @@ def _subdivide_corners(corners: np.ndarray) -> np.ndarray:
 
 #: Edge of the skin atlas in texels; about 0.25 mm of skin each.
 ATLAS = 1024
+# What is painted, as fields of a material.
+_MAPS = ("albedo", "height", "roughness")
 # Reflectance of skin at normal incidence, and how far light wraps around the terminator inside it,
 # per linear channel.
 _GLOSS, _WRAP = 0.028, (0.28, 0.12, 0.07)
@@ -614,7 +616,7 @@ def kept(hand: SubjectHand, subject: Subject, part: str, paint: Callable[[], Mat
     if path.exists():
         try:
             arrays = read_npz(path)
-            return skin_material(*(arrays[name] for name in ("albedo", "height", "roughness")))
+            return skin_material(*(arrays[name] for name in _MAPS))
         except (BadInput, KeyError):
             with contextlib.suppress(OSError):
                 path.unlink(missing_ok=True)
@@ -622,7 +624,8 @@ def kept(hand: SubjectHand, subject: Subject, part: str, paint: Callable[[], Mat
     # Where the cache cannot be written, it is painted again next time.
     with contextlib.suppress(HwpError):
         buffer = io.BytesIO()
-        np.savez(buffer, albedo=atlas.albedo, height=atlas.height, roughness=atlas.roughness)
+        maps: dict[str, Any] = {name: getattr(atlas, name) for name in _MAPS}
+        np.savez(buffer, **maps)
         atomic_write(path, buffer.getvalue())
     return atlas
 

@@ -62,7 +62,7 @@ class Looks:
     def on(self, side: str) -> Looks:
         """The looks of one hand; hands that look alike give equal looks and share one painting."""
 
-        worn = {}
+        worn: dict[str, Any] = {}
         for name in ("tattoos", "polish", "rings", "wrist", "gloves"):
             items = [item for item in getattr(self, name) if item.side in (side, "both")]
             worn[name] = tuple(replace(item, side="both") for item in items)

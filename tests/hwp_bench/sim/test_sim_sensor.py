@@ -196,26 +196,6 @@ def test_a_fast_readout_is_no_rolling_shutter(
         np.testing.assert_array_equal(slow.rgb, slow.clean)
 
 
-@pytest.mark.parametrize(
-    ("lines", "field"),
-    [
-        ("jpeg_quality = 50", "sensor.noise"),
-        ("noise = 0.3", "sensor.noise"),
-        ("noise = 0.01\njpeg_quality = 1.5", "sensor.jpeg_quality"),
-        ("noise = 0.01\njpeg_quality = 101", "sensor.jpeg_quality"),
-        ("noise = 0.01\nrolling_shutter = 0.2", "sensor.rolling_shutter"),
-        ("noise = 0.01\nrolling_shutter = -0.01", "sensor.rolling_shutter"),
-        ("noise = 0.01\nlens = 1", "sensor.lens"),
-    ],
-)
-def test_a_wrong_sensor_is_named(
-    with_sensor: Callable[[str], Scene], lines: str, field: str
-) -> None:
-    with pytest.raises(BadInput) as caught:
-        with_sensor(lines)
-    assert caught.value.field == field
-
-
 def test_noise_is_said_once_and_the_sensor_in_its_own_table(make_scene: SceneMaker) -> None:
     with pytest.raises(BadInput, match="noise"):
         make_scene(("[light]", "[sensor]\nnoise = 0.01\n[light]"))

@@ -17,7 +17,6 @@ from hypothesis import strategies as st
 
 from benchmarks.penetration import hand_penetration
 from benchmarks.subjects import ANATOMIES, SHOWN
-from hwp_bench.base.errors import BadInput
 from hwp_bench.hands import HandTemplate, load_template
 from hwp_bench.hands.skeleton import PARENTS
 from hwp_bench.sim.hand.anatomy import SubjectAnatomy, off_template, resized, reweighted
@@ -269,20 +268,6 @@ def test_a_scene_without_the_table_is_as_it_was(make_scene: SceneMaker) -> None:
     empty = make_scene(("[camera]", "[subject.anatomy]\n\n[camera]"))
     assert not is_off_template(empty.subject)
     assert person(empty.subject, "right")[0].name == "anny-1"
-
-
-@pytest.mark.parametrize(
-    ("line", "field"),
-    [
-        ("joint_shift = 9.0", "joint_shift"),
-        ("finger_lengths = [1.0, 1.0, 1.0, 1.0, 2.0]", "finger_lengths"),
-        ("palm = [1.0, 1.0]", "palm"),
-        ("nail_lenght = 2.0", "nail_lenght"),
-    ],
-)
-def test_wrong_fields_are_named(make_scene: SceneMaker, line: str, field: str) -> None:
-    with pytest.raises(BadInput, match=f"subject.anatomy.{field}"):
-        make_scene(("[camera]", f"[subject.anatomy]\n{line}\n\n[camera]"))
 
 
 @pytest.mark.usefixtures("small_paintings")

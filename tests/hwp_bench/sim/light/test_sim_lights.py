@@ -15,7 +15,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_scene import BLUR, CLEAN, LIGHT, OBJECT
 
-from hwp_bench.base.errors import BadInput
 from hwp_bench.sim.effects import lights_at, plan_frame
 from hwp_bench.sim.geometry.surface import LIFT, RenderCost, Surface, Tracer, plain
 from hwp_bench.sim.light.lights import (
@@ -159,21 +158,6 @@ def test_white_walls_are_a_white_sky_and_shares_add_up() -> None:
     towards = wall_irradiance(red)
     np.testing.assert_allclose(towards[1], [1.0, 1 - FACING_SHARE, 1 - FACING_SHARE], atol=1e-12)
     np.testing.assert_allclose(towards[0], 1.0)
-
-
-@pytest.mark.parametrize(
-    ("lines", "field"),
-    [
-        ("[[light.lamps]]\nplace = [0.1, 0.0, 0.0]\nstrength = 1.0", "light.lamps[0].place"),
-        ("[[light.lamps]]\nplace = [1.0, 0.0, 0.0]", "light.lamps[0].strength"),
-        ("[light.room]\nleft = [2.0, 0.0, 0.0]", "light.room.left[0]"),
-        ("[light.room]\nnorth = [1.0, 0.0, 0.0]", "light.room.north"),
-    ],
-)
-def test_a_wrong_light_is_named(make_scene: SceneMaker, lines: str, field: str) -> None:
-    with pytest.raises(BadInput) as caught:
-        make_scene(("[track]", f"{lines}\n[track]"))
-    assert caught.value.field == field
 
 
 def test_a_scene_pays_for_what_it_asks(make_scene: SceneMaker) -> None:

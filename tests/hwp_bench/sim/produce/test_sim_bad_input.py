@@ -52,8 +52,13 @@ BAD_SCENES = {
 }
 
 
-@pytest.mark.parametrize("case", BAD_SCENES)
-@pytest.mark.parametrize("action", ["render", "plan", "preview", "calibrate"])
+@pytest.mark.parametrize(
+    ("case", "action"),
+    [
+        *((case, "render") for case in BAD_SCENES),
+        *(("no TOML", action) for action in ("plan", "preview", "calibrate")),
+    ],
+)
 def test_a_bad_scene_is_one_line(
     case: str, action: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -69,15 +74,6 @@ def test_a_bad_scene_is_one_line(
     for word in (str(path), *words):
         assert word in shown.err
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_a_severity_out_of_range_names_the_range(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "out"
-    assert main(["sim", "render", "capture0", "-o", str(out), "--severity", "9"]) == 2
-    assert "severity: 9.0 is not in 1..5" in capsys.readouterr().err
-    assert not out.exists()
 
 
 def _finished(folder: Path) -> int:

@@ -39,7 +39,7 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     path = tmp_path_factory.mktemp("sim") / "tiny"
     scene = parse_scene(SINGLE, where="tiny.toml")
-    render_capture(scene, path, frame_count=FRAMES, size=SIZE, workers=1, exr=True)
+    render_capture(scene, path, frame_count=FRAMES, size=SIZE, workers=1, exr=True, free_view=False)
     return path
 
 
@@ -196,9 +196,9 @@ def test_a_suite_in_the_cache_is_not_rendered_again(
 
     item = suites.SuiteItem(make_scene(), 10, 32)
     monkeypatch.setattr(suites, "suite", lambda name: (item,))
-    (first,) = ensure_suite("smoke", tmp_path, workers=1)
+    (first,) = ensure_suite("smoke", tmp_path, workers=1, free_view=False)
     monkeypatch.setattr(production, "render_waiting", None)
-    assert ensure_suite("smoke", tmp_path) == [first]
+    assert ensure_suite("smoke", tmp_path, free_view=False) == [first]
 
 
 def test_masks_err_at_borders_and_occluders(make_scene: SceneMaker) -> None:

@@ -11,7 +11,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hwp_bench.base.errors import BadInput
 from hwp_bench.hands import load_template
 from hwp_bench.hands.poses import RestSkeleton, posed_skeleton, rest_skeleton, turned
 from hwp_bench.sim.effects import plan_frame
@@ -152,18 +151,3 @@ def test_scenes_scale_the_errors_and_flag_the_failures(
     often, _, valid = estimated(Estimator("tracker", failures=0.3))
     assert 0.1 < 1.0 - valid.mean() < 0.5
     assert np.abs(often[~valid]).mean() > 1.5 * np.abs(often[valid]).mean()
-
-
-@pytest.mark.parametrize(
-    ("lines", "field"),
-    [
-        ('kind = "oracle"', "estimator.kind"),
-        ('kind = "tracker"\nscale = -1.0', "estimator.scale"),
-        ('kind = "tracker"\nfailures = 0.9', "estimator.failures"),
-        ("scale = 1.0", "estimator.kind"),
-    ],
-)
-def test_a_wrong_estimator_is_named(make_scene: SceneMaker, lines: str, field: str) -> None:
-    with pytest.raises(BadInput) as caught:
-        make_scene(("[track]", f"[estimator]\n{lines}\n\n[track]"))
-    assert caught.value.field == field

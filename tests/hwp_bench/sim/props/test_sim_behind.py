@@ -15,7 +15,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_scene import BLUR, CLEAN
 
-from hwp_bench.base.errors import BadInput
 from hwp_bench.sim.effects import plan_frame
 from hwp_bench.sim.props import behind as planes
 from hwp_bench.sim.props.behind import (
@@ -164,18 +163,3 @@ def test_a_plane_is_the_backdrop_of_its_name(make_scene: SceneMaker) -> None:
     assert seen.shape == rays.shape
     assert seen[SIZE // 2, :, 0].min() >= 0.9 * middle.min()
     assert seen[SIZE // 2, :, 0].max() <= 1.1 * middle.max()
-
-
-@pytest.mark.parametrize(
-    ("table", "field"),
-    [
-        ("[behind]\nghost = 1", "behind.ghost"),
-        ("[behind.face]\nsize = 9.0", "behind.face.size"),
-        ('[behind.arm]\nside = "top"', "behind.arm.side"),
-        ("[behind.clutter]\ncount = 0", "behind.clutter.count"),
-    ],
-)
-def test_damage_is_named(make_scene: SceneMaker, table: str, field: str) -> None:
-    with pytest.raises(BadInput) as caught:
-        make_scene(("[camera]", f"{table}\n\n[camera]"))
-    assert field in str(caught.value)

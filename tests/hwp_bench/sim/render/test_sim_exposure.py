@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 from tiny_scene import CLEAN, LIGHT, OBJECT
 
 from hwp_bench.base.colors import LUMINANCE
-from hwp_bench.base.errors import BadInput
 from hwp_bench.sim.effects import plan_frame
 from hwp_bench.sim.geometry.surface import RenderCost
 from hwp_bench.sim.render import frame as metering
@@ -53,22 +52,6 @@ def test_later_fields_are_in_the_scene_only_where_they_say_something(
     after = make_scene(("noise = 0.01\n", ""), ("[light]", lines + table + "[light]"))
     assert after.to_json()["sensor"]["auto"]["level"] == 0.3
     assert after.digest != before.digest
-
-
-@pytest.mark.parametrize(
-    ("lines", "field"),
-    [
-        ("sharpening = -0.1", "sensor.sharpening"),
-        ("[sensor.auto]\nlevel = 0.0", "sensor.auto.level"),
-        ("[sensor.auto]\nlag = 0.0", "sensor.auto.lag"),
-        ("[sensor.auto]\niso = 100", "sensor.auto.iso"),
-    ],
-)
-def test_a_wrong_setting_is_named(make_scene: SceneMaker, lines: str, field: str) -> None:
-    table = f"[sensor]\nnoise = 0.01\n{lines}\n[light]"
-    with pytest.raises(BadInput) as caught:
-        make_scene(("noise = 0.01\n", ""), ("[light]", table))
-    assert caught.value.field == field
 
 
 def test_the_level_is_reached(automatic: Callable[[AutoControl], Scene]) -> None:
