@@ -262,8 +262,8 @@ def gloss_lobe(
     cosine: float,
     roughness: np.float32,
     specular: np.float32,
-) -> tuple[float, float]:
-    """Gloss of a lamp, and of the sky at grazing view, both before what arrives.
+) -> float:
+    """Gloss of a lamp, before what arrives.
 
     Source: the GGX lobe with Schlick's Fresnel term and Smith-Schlick visibility.
     """
@@ -282,8 +282,7 @@ def gloss_lobe(
     k = alpha / np.float32(2.0)
     shape = 0.25 / ((nl * (_ONE - k) + k) * (nv * (_ONE - k) + k))
     fresnel = specular + (_ONE - specular) * _fifth(1.0 - vh)
-    edge = specular + (_ONE - specular) * _fifth(1.0 - nv)
-    return lobe * shape * fresnel * nl, 0.5 * edge * (_ONE - _MOST_GLOSS * roughness)
+    return lobe * shape * fresnel * nl
 
 
 @helper
@@ -325,9 +324,9 @@ def radiance(
     for i in range(len(normals)):
         normal, view, open_, beam = normals[i], views[i], openness[i], lit[i]
         cosine = dot(normal, direction)
-        gloss, edge = gloss_lobe(normal, view, direction, cosine, roughness[i], specular[i])
+        gloss = gloss_lobe(normal, view, direction, cosine, roughness[i], specular[i])
         gloss = gloss * beam * math.pi
-        edge = edge * open_
+        edge = grazing(normal, view, roughness[i], specular[i]) * open_
         up = 0.5 - 0.5 * normal[1]
         for k in range(3):
             color, around = albedo[i, k], wrap[i, k]
@@ -535,7 +534,7 @@ def _from_point(
     for i in range(len(normals)):
         normal, direction, beam = normals[i], directions[i], arrives[i]
         cosine = dot(normal, direction)
-        gloss, _ = gloss_lobe(normal, views[i], direction, cosine, roughness[i], specular[i])
+        gloss = gloss_lobe(normal, views[i], direction, cosine, roughness[i], specular[i])
         gloss = gloss * beam * math.pi
         for k in range(3):
             wide = _ONE + wrap[i, k]

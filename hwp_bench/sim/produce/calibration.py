@@ -69,7 +69,8 @@ def calibrate(scene: Scene, call: EffectCall, size: int = SIZE) -> Calibration:
     covering = call.kind == "hand_object_interaction"
     top = EFFECTS[call.kind].max_strength
     tried = top * (_TRIED_LINEAR if covering else _TRIED)
-    frames = _frames(scene, call)
+    # The middle of every episode.
+    frames = [round(0.5 * (part.start + part.end) * scene.frame_count) for part in call.episodes]
     measure = _measure(scene, call, frames, size)
     losses = [measure(float(strength)) for strength in track(tried, f"{scene.id} {call.kind}")]
     targets = TARGETS[call.kind]
@@ -108,11 +109,6 @@ def _with_strengths(text: str, item: Calibration, where: str) -> str:
             f"names {item.kind} {count} times as a line of its own", where=where, field="effects"
         )
     return changed
-
-
-def _frames(scene: Scene, call: EffectCall) -> list[int]:
-    """The middle of every episode."""
-    return [round(0.5 * (part.start + part.end) * scene.frame_count) for part in call.episodes]
 
 
 def _measure(
@@ -154,17 +150,10 @@ def _pose_loss(scene: Scene, frame: int, size: int, strength: float) -> float:
         wrong[side] = (pose + turn, transl + length * rng.normal(size=3) * [1.0, 1.0, 2.0])
     lens = Lens(intrinsics(scene, size), viewmat(scene, seconds), size, 1, seconds=seconds)
     lights = steady_light(scene.light)
-    images = [
-        render_instant(
-            scene,
-            lens,
-            stage.traced(stage.surface(hands, MOVING, parameters)),
-            None,
-            lights,
-            cost,
-        )
-        for parameters in (stage.parameters(hands), wrong)
-    ]
+    images = []
+    for parameters in (stage.parameters(hands), wrong):
+        body = stage.traced(stage.surface(hands, MOVING, parameters))
+        images.append(render_instant(scene, lens, body, None, lights, cost))
     hand = images[0].coverage > 0.999
     true, believed = (linear_to_srgb(image.color[hand]) for image in images)
     return _psnr(believed, true)

@@ -108,11 +108,9 @@ def free_moments(scene: Scene, count: int = FRAMES) -> list[dict[str, HandMoment
             rng = generator(scene.seed, "free pose", side, frame)
             shape = gestures()[names[order[frame % len(names)]]]
             moment = track_moment(scene, side, seconds)
-            hands[side] = replace(
-                moment,
-                angles=within_limits(shape + rng.normal(0.0, _ANGLES, shape.shape)),
-                heading=moment.heading + rng.normal(0.0, _TURN, 3),
-            )
+            angles = within_limits(shape + rng.normal(0.0, _ANGLES, shape.shape))
+            heading = moment.heading + rng.normal(0.0, _TURN, 3)
+            hands[side] = HandMoment(angles, moment.place, heading)
         frames.append(hands)
     return frames
 
@@ -231,10 +229,8 @@ def _apart(scene: Scene, hands: dict[str, HandMoment]) -> dict[str, HandMoment]:
     while tree.query(surfaces[first] + push * line)[0].min() < GAP:
         push += GAP / 2.0
     half = push / 2.0 * line
-    return {
-        first: replace(one, place=one.place + half),
-        second: replace(other, place=other.place - half),
-    }
+    moved = (replace(one, place=one.place + half), replace(other, place=other.place - half))
+    return dict(zip((first, second), moved, strict=True))
 
 
 def has_free_view(capture: Path) -> bool:

@@ -69,21 +69,16 @@ def strip(results: list[SimulatedFrame], columns: int) -> np.ndarray:
 
 
 def _captioned(result: SimulatedFrame) -> np.ndarray:
-    severity = [
-        f"{perturbation(name).short}{value}"
-        for name, value in result.plan.severity.items()
-        if value
-    ]
-    return captioned(result.rgb, " ".join([str(result.plan.frame), *severity]))
+    acting = ((name, value) for name, value in result.plan.severity.items() if value)
+    words = [f"{perturbation(name).short}{value}" for name, value in acting]
+    return captioned(result.rgb, " ".join([str(result.plan.frame), *words]))
 
 
 def _animation(results: list[SimulatedFrame]) -> bytes:
     from PIL import Image
 
-    frames = [
-        Image.fromarray(np.concatenate([result.rgb, result.clean], axis=1)).quantize(128)
-        for result in results
-    ]
+    pairs = [np.concatenate([result.rgb, result.clean], axis=1) for result in results]
+    frames = [Image.fromarray(pair).quantize(128) for pair in pairs]
     buffer = io.BytesIO()
     frames[0].save(
         buffer, format="GIF", save_all=True, append_images=frames[1:], duration=FRAME_MS, loop=0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -151,17 +151,11 @@ def distances(scene: Scene) -> dict[str, TemplateDistance]:
 
 def subject_table(found: dict[str, dict[str, TemplateDistance]]) -> Table:
     """One row for each hand."""
-    rows: list[tuple[Cell, ...]] = [
-        (
-            name,
-            side,
-            item.surface,
-            *(item.mean_mm, item.most_mm, item.largest_mm, item.joints_mm),
-            item.farthest_joint_mm,
-        )
-        for name, hands in found.items()
-        for side, item in hands.items()
-    ]
+    rows: list[tuple[Cell, ...]] = []
+    for name, hands in found.items():
+        for side, item in hands.items():
+            # All but the betas.
+            rows.append((name, side, *astuple(item)[:-1]))
     numbers = ("mean, mm", "95 %", "largest", "joints, mean mm", "farthest joint")
     columns = [Column(name) for name in ("scene", "hand", "surface")]
     columns += [Column(name, digits=1) for name in numbers]

@@ -218,12 +218,10 @@ class Window:
             return hands
         way = np.array([*self.shutter.hand, 0.0])
         twist = np.array([0.0, 0.0, self.shutter.twist])
-        return {
-            side: replace(
-                hand, place=hand.place + s * self._width * way, heading=hand.heading + s * twist
-            )
-            for side, hand in hands.items()
-        }
+        for side, hand in hands.items():
+            place, heading = hand.place + s * self._width * way, hand.heading + s * twist
+            hands[side] = HandMoment(hand.angles, place, heading)
+        return hands
 
     def view(self, s: float) -> np.ndarray:
         """(4, 4) world to camera."""
