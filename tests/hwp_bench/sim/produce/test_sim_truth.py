@@ -42,7 +42,7 @@ knuckles = 1.5
 
 
 @pytest.fixture
-def capture(make_scene: SceneMaker, tmp_path: Path) -> Capture:
+def capture(make_scene: SceneMaker, tmp_path: Path, small_paintings: None) -> Capture:
     scene = make_scene(("age = 31.0\n", PERSON))
     render_capture(
         scene, tmp_path / "tiny", frame_count=FRAMES, size=SIZE, workers=1, free_view=False

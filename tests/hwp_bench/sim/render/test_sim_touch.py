@@ -19,7 +19,7 @@ from hwp_bench.sim.subject.hand import MOVING
 
 INTERACTING = [name for name in scene_names() if load_scene(name).hands == "both"]
 #: Deepest that one hand may press into the other, m.
-DEEPEST = 0.012
+TOUCH_DEEPEST = 0.012
 
 
 def _distances(name: str, moment: float) -> tuple[float, float]:
@@ -42,5 +42,5 @@ def _distances(name: str, moment: float) -> tuple[float, float]:
 def test_hands_do_not_run_through_each_other(name: str) -> None:
     rows = [_distances(name, frame / 60) for frame in range(0, 60, 2)]
     depth, gap = np.array(rows).T
-    assert depth.max() < DEEPEST
+    assert depth.max() < TOUCH_DEEPEST
     assert gap.min() < 0.004  # and they touch at times
