@@ -61,7 +61,6 @@ class Looks:
 
     def on(self, side: str) -> Looks:
         """The looks of one hand; hands that look alike give equal looks and share one painting."""
-
         worn: dict[str, Any] = {}
         for name in ("tattoos", "polish", "rings", "wrist", "gloves"):
             items = [item for item in getattr(self, name) if item.side in (side, "both")]
