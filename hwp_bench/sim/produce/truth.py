@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -154,8 +154,9 @@ def subject_table(found: dict[str, dict[str, TemplateDistance]]) -> Table:
     rows: list[tuple[Cell, ...]] = []
     for name, hands in found.items():
         for side, item in hands.items():
-            # All but the betas.
-            rows.append((name, side, *astuple(item)[:-1]))
+            surface = (item.mean_mm, item.most_mm, item.largest_mm)
+            joints = (item.joints_mm, item.farthest_joint_mm)
+            rows.append((name, side, item.surface, *surface, *joints))
     numbers = ("mean, mm", "95 %", "largest", "joints, mean mm", "farthest joint")
     columns = [Column(name) for name in ("scene", "hand", "surface")]
     columns += [Column(name, digits=1) for name in numbers]
