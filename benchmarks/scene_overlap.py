@@ -13,7 +13,7 @@ from dataclasses import asdict
 from hwp_bench.sim.effects import ComplexPoses, ObjectInteraction, read_effect
 from hwp_bench.sim.hand.rigs import FROM_FILE, SHIPPED
 from hwp_bench.sim.scene.scene import HandKey, Scene
-from hwp_bench.sim.subject.subject import Subject
+from hwp_bench.sim.subject.subject import Subject, without_defaults
 
 #: What a scene is made of, and what of it two sets may not share.
 KINDS = ("subject", "looks", "room", "light", "object", "gestures")
@@ -83,7 +83,7 @@ def _identity(subject: Subject, scene_seed: int) -> Iterator[str]:
 
 def _looks(subject: Subject) -> Iterator[str]:
     yield f"tone {subject.tone:g} at {subject.age:g} years"
-    for name, value in subject.looks.to_json().items():
+    for name, value in without_defaults(subject.looks).items():
         for item in value if isinstance(value, (list, tuple)) else ():
             if isinstance(item, dict):
                 item = {key: part for key, part in item.items() if key != "side"}
