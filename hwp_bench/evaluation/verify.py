@@ -44,7 +44,7 @@ from hwp_bench.results import (
 )
 from hwp_bench.results.schema import MAX_BYTES, code_digest, environment
 from hwp_bench.results.store import content_digest
-from hwp_bench.sim.produce.suites import suite_names
+from hwp_bench.sim.produce.capture import suite_names
 
 #: Largest difference of a score that rounding on another processor may make.
 TOLERANCE = 1e-6

@@ -27,8 +27,8 @@ from hwp_bench.report.figures import draw_pareto, inline_svg
 from hwp_bench.report.study_tables import METRIC
 from hwp_bench.results import CaptureResult, Results
 from hwp_bench.results.schema import score_rows
-from hwp_bench.sim.produce.suites import suite
-from hwp_bench.sim.scene.motion import moments, severity
+from hwp_bench.sim.produce.capture import suite
+from hwp_bench.sim.scene.scene import moments, severity
 from hwp_bench.taxonomy import PERTURBATIONS, perturbation
 
 #: The badge of a row is the first of these that one of its entries has.

@@ -18,8 +18,7 @@ from hwp_bench.base.records import Digest, Line, parse_record, without_schema
 from hwp_bench.capture import open_capture
 from hwp_bench.evaluation.sentences import is_of_suite
 from hwp_bench.results import Results
-from hwp_bench.sim.produce.capture import RENDERER
-from hwp_bench.sim.produce.suites import suite_names
+from hwp_bench.sim.produce.capture import RENDERER, suite_names
 
 #: Version of the file.
 SCHEMA = "hwp-suite-data/2"

@@ -21,8 +21,7 @@ from hwp_bench.commitments import suite as making
 from hwp_bench.commitments.publication import joint_commitment
 from hwp_bench.commitments.recipe import derived, read_secret, recipe_of, sealed_items
 from hwp_bench.methods.request import open_request
-from hwp_bench.sim.render import stage
-from hwp_bench.sim.subject import atlas
+from hwp_bench.sim.subject import hand as atlas
 
 RECIPE = recipe_of(["capture2"], 10, 40)
 NAME = "sealed-capture2"
@@ -35,10 +34,8 @@ def small_skin() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(atlas, "ATLAS", 256)
         atlas.skin_atlas.cache_clear()
-        stage._skin.cache_clear()
         yield
     atlas.skin_atlas.cache_clear()
-    stage._skin.cache_clear()
 
 
 @pytest.fixture(scope="module")

@@ -28,8 +28,7 @@ from hwp_bench.leaderboard.entries import Submission, make_entry, write_check, w
 from hwp_bench.leaderboard.site import build_site
 from hwp_bench.report.sources import mean_severity
 from hwp_bench.results.schema import score_rows
-from hwp_bench.sim.produce.capture import render_capture
-from hwp_bench.sim.produce.suites import SuiteItem
+from hwp_bench.sim.produce.capture import SuiteItem, render_capture
 from hwp_bench.sim.scene_files import load_scene
 
 

@@ -150,7 +150,7 @@ names = [name for name in NAMES if imports(name)]
 print(json.dumps({"found": found, "imports": names}))
 """
     hidden = [
-        "hwp_bench.sim.produce.suites",
+        "hwp_bench.sim.produce.capture",
         "hwp_bench.sim.produce.capture",
         "hwp_bench.sim.scene.scene",
         "hwp_bench.evaluation.evaluate",
