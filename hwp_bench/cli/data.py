@@ -314,7 +314,7 @@ def _add_inputs(parser: argparse.ArgumentParser) -> None:
 
 def _inputs(args: argparse.Namespace) -> int:
     from hwp_bench.commitments.inputs import check_place, write_inputs
-    from hwp_bench.evaluation.evaluate import open_captures
+    from hwp_bench.commitments.publication import open_captures
     from hwp_bench.sim import ensure_suite
 
     # Before a suite is rendered.

@@ -101,22 +101,17 @@ class AttributeHead(nn.Module):
                 self.direct.weight.zero_()
                 self.direct.weight[:, :CHANNELS] = torch.diag(torch.tensor(DIRECT_GAINS))
 
-    def direct_weight(self) -> Tensor:
-        """(14, I) matrix of the direct path; (14, 0) without it."""
-        if self.direct is None:
-            return self.attributes.weight.new_zeros(CHANNELS, 0)
-        return self.direct.weight
-
     def forward(
-        self, hidden: Tensor, x_g: Tensor, latent: Tensor, initial: Tensor
+        self, hidden: Tensor, x_g: Tensor | None, latent: Tensor, initial: Tensor
     ) -> RawAttributes:
         """Raw attributes (B, N, k).
 
-        `hidden` (N, width) is from the texture features, `x_g` (B, N, Fg) the geometry features,
+        `hidden` (N, width) is from the texture features, `x_g` (B, N, Fg) the geometry features
+        (None: the texture branch alone, (N, k)),
         `latent` (N, I) the identity features (I is 0 without the direct path), `initial` (N, 14)
         the start.
         """
-        change = self.attributes(hidden + self.geometry(x_g))
+        change = self.attributes(hidden if x_g is None else hidden + self.geometry(x_g))
         canonical = initial.to(change.dtype)
         if self.direct is not None:
             canonical = canonical + self.direct(latent)
@@ -138,11 +133,7 @@ class ShadowHead(nn.Module):
 
     def forward(self, x_g: Tensor) -> Tensor:
         """(B, N, Fg) to (B, N, 1) in (0, 1)."""
-        return self.activate(self.light(x_g) + self.detail(x_g))
-
-    def activate(self, logit: Tensor) -> Tensor:
-        """From a logit of any shape, 0 at the start, to (0, 1)."""
-        return torch.sigmoid(self.start + logit)
+        return torch.sigmoid(self.start + self.light(x_g) + self.detail(x_g))
 
 
 class TemplateHead(nn.Module):
