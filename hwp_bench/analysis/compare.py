@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import combinations
 from string import ascii_lowercase
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -31,25 +31,34 @@ from hwp_bench.taxonomy import PERTURBATIONS, perturbation
 ALPHA = 0.05
 
 
-@dataclass(frozen=True)
-class Difference:
+@dataclass(frozen=True, kw_only=True)
+class Contrast:
+    """A difference of paired scores in one metric and scope."""
+
+    #: Name of the metric.
+    metric: str
+    #: A scope of `analysis.pairing.scopes`.
+    scope: str
+    #: In the metric's unit.
+    estimate: Estimate
+    #: Probability that what is added makes the score better, in the metric's own direction.
+    better: float | None
+    #: p-value, adjusted over the perturbations for perturbations and over the pairs of methods
+    #: for the macro mean; None where nothing is adjusted.
+    p_adjusted: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Difference(Contrast):
     """One method less another in one scope."""
 
     #: Label of the first method.
     first: str
     #: Label of the second.
     second: str
-    #: Name of the metric.
-    metric: str
-    #: A scope of `analysis.pairing.scopes`.
-    scope: str
-    #: First less second, in the metric's unit.
-    estimate: Estimate
-    #: Probability that the first is better, in the metric's own direction.
-    better: float | None
-    #: p-value, adjusted over the perturbations for perturbations and over the pairs of methods
-    #: for the macro mean; None where nothing is adjusted.
-    p_adjusted: float | None = None
+
+
+_Contrast = TypeVar("_Contrast", bound=Contrast)
 
 
 @dataclass(frozen=True)
@@ -76,28 +85,50 @@ def compare(
     seed: int = 0,
     scope: str | None = None,
 ) -> list[Difference]:
-    """Return the difference of every pair of methods in every scope, or in one scope alone.
+    """Return the difference of every pair of methods in every scope.
 
     The runs must have passed `analysis.pairing.refuse_unlike`.
+
+    Args:
+        runs: at least two methods.
+        scope: the only scope that is wanted; None takes all.
     """
-    found: list[Difference] = []
+    differences: list[Difference] = []
     for first, second in combinations(runs, 2):
-        seeds, start = common_seeds(first, second), len(found)
-        for name, weights in scopes(first.first).items():
-            if scope not in (None, name):
-                continue
-            samples = [
-                first.values(c, metric, seeds) - second.values(c, metric, seeds) for c in weights
-            ]
-            estimate = bootstrap_mean(
-                samples, list(weights.values()), resamples=resamples, seed=seed
-            )
-            better = _surely(estimate, metric)
-            found.append(Difference(first.label, second.label, metric, name, estimate, better))
-        own = [place for place in range(start, len(found)) if found[place].scope in PERTURBATIONS]
-        _adjust(found, own)
-    _adjust(found, [place for place, item in enumerate(found) if item.scope == MACRO])
-    return found
+        seeds = common_seeds(first, second)
+        terms = ((1.0, first), (-1.0, second))
+        differences += [
+            Difference(first=first.label, second=second.label, **vars(item))
+            for item in contrasts(terms, metric, seeds, resamples=resamples, seed=seed, only=scope)
+        ]
+    return _adjusted(differences, lambda found: found == MACRO)
+
+
+def contrasts(
+    terms: Sequence[tuple[float, MethodRuns]],
+    metric: str,
+    seeds: Sequence[int],
+    *,
+    resamples: int = RESAMPLES,
+    seed: int = 0,
+    only: str | None = None,
+) -> list[Contrast]:
+    """Return the sum of runs, each times its factor, in every scope or the only one wanted.
+
+    p-values are adjusted over the perturbations.
+    """
+    found = []
+    for scope, weights in scopes(terms[0][1].first).items():
+        if only not in (None, scope):
+            continue
+        samples = [
+            np.sum([factor * run.values(capture, metric, seeds) for factor, run in terms], axis=0)
+            for capture in weights
+        ]
+        estimate = bootstrap_mean(samples, list(weights.values()), resamples=resamples, seed=seed)
+        better = _surely(estimate, metric)
+        found.append(Contrast(metric=metric, scope=scope, estimate=estimate, better=better))
+    return _adjusted(found, lambda scope: scope in PERTURBATIONS)
 
 
 def _surely(estimate: Estimate, metric: str) -> float | None:
@@ -107,11 +138,11 @@ def _surely(estimate: Estimate, metric: str) -> float | None:
     return 1 - estimate.above
 
 
-def _adjust(found: list[Difference], places: Iterable[int]) -> None:
-    """Put Holm's p-values of one family into the list."""
-    tested = [(place, p) for place in places if (p := found[place].estimate.p) is not None]
-    for (place, _), value in zip(tested, holm([p for _, p in tested]), strict=True):
-        found[place] = replace(found[place], p_adjusted=value)
+def _adjusted(found: Sequence[_Contrast], in_family: Callable[[str], bool]) -> list[_Contrast]:
+    """Put Holm's p-values of the family of some scopes into the list."""
+    family = [item for item in found if in_family(item.scope) and item.estimate.p is not None]
+    adjusted = iter(holm([item.estimate.p or 0.0 for item in family]))
+    return [replace(item, p_adjusted=next(adjusted)) if item in family else item for item in found]
 
 
 def standings(
@@ -364,20 +395,27 @@ def scope_title(scope: str) -> str:
     return {MACRO: "Macro", "single": "Single", "interacting": "Interacting"}.get(scope, scope)
 
 
-def estimate_columns(metric: str) -> tuple[Column, ...]:
-    """Return the columns of an estimate in a metric: value, interval."""
+def contrast_columns(found: Sequence[Contrast], metric: str, better: str) -> list[Filled]:
+    """Return the columns of scope, estimate and tests, with the unit and digits of a metric."""
     facts = metric_facts(metric)
     unit = f" [{facts.unit}]" if facts.unit else ""
-    return (
-        Column(f"Difference{unit}", facts.digits),
-        Column("Low", facts.digits, group="95 % interval"),
-        Column("High", facts.digits, group="95 % interval"),
-    )
+    estimates = [item.estimate for item in found]
+    return [
+        (Column("Scope"), [scope_title(item.scope) for item in found]),
+        (Column("Captures", 0), [one.captures for one in estimates]),
+        (Column(f"Difference{unit}", facts.digits), [one.value for one in estimates]),
+        (Column("Low", facts.digits, group="95 % interval"), [one.low for one in estimates]),
+        (Column("High", facts.digits, group="95 % interval"), [one.high for one in estimates]),
+        (Column(better, 3), [item.better for item in found]),
+        (Column("p", 4), [one.p for one in estimates]),
+        (Column("p (Holm)", 4), [item.p_adjusted for item in found]),
+        (Column("Detectable", facts.digits), [one.detectable for one in estimates]),
+    ]
 
 
-def estimate_cells(estimate: Estimate) -> tuple[float | None, ...]:
-    """Return the cells of `estimate_columns`."""
-    return (estimate.value, estimate.low, estimate.high)
+def one_capture_notes(found: Sequence[Contrast]) -> list[str]:
+    """Return what is said under a table that has scopes of one capture."""
+    return [ONE_CAPTURE] if any(item.estimate.captures == 1 for item in found) else []
 
 
 def standings_table(metric: str, found: Sequence[Standing]) -> Table:
@@ -400,28 +438,18 @@ def standings_table(metric: str, found: Sequence[Standing]) -> Table:
 def differences_table(metric: str, found: Sequence[Difference]) -> Table:
     """Return one row a pair and scope."""
     facts = metric_facts(metric)
-    estimates = [item.estimate for item in found]
     columns: list[Filled] = [
         (Column("First"), [item.first for item in found]),
         (Column("Second"), [item.second for item in found]),
-        (Column("Scope"), [scope_title(item.scope) for item in found]),
-        (Column("Captures", 0), [one.captures for one in estimates]),
-        *zip(
-            estimate_columns(metric), zip(*map(estimate_cells, estimates), strict=True), strict=True
-        ),
-        (Column("P(first better)", 3), [item.better for item in found]),
-        (Column("p", 4), [one.p for one in estimates]),
-        (Column("p (Holm)", 4), [item.p_adjusted for item in found]),
-        (Column("Detectable", facts.digits), [one.detectable for one in estimates]),
+        *contrast_columns(found, metric, "P(first better)"),
     ]
     direction = "above" if facts.higher_is_better else "below"
     notes = [
         f"First less second; {direction} 0 the first is better. {_INTERVAL}",
         "p (Holm): over the perturbations of a pair, and over the pairs for the macro mean. "
         "Detectable: the true difference that such a comparison finds with 80 % probability.",
+        *one_capture_notes(found),
     ]
-    if any(item.estimate.captures == 1 for item in found):
-        notes.append(ONE_CAPTURE)
     return table_of(f"{facts.label}: differences", columns, notes)
 
 
