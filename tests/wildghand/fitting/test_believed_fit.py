@@ -25,7 +25,7 @@ from wildghand.export.formats import ExportSettings, export
 from wildghand.fitting import start
 from wildghand.fitting.method import WildGHandMethod
 from wildghand.model import terms
-from wildghand.page.poses import PageSettings, sample_poses
+from wildghand.page.write import PageSettings, sample_poses
 from wildghand.poses import ClipPoses
 from wildghand.viewer.posed_view import Motion
 
