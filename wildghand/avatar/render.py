@@ -21,7 +21,6 @@ from hwp_bench.capture import Capture
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.gaussians.training import TrainingClip
 from wildghand.model.frames import largest
-from wildghand.model.model import WildGHandModel
 from wildghand.splat.threads import denormals_flushed
 
 
@@ -125,19 +124,25 @@ def explain_frames(
         if frame not in fitted:
             raise UsageError(f"{frame} was not fitted", field="frames")
     clip = TrainingClip(capture, np.array(fitted), model.rigs, torch.device("cpu"))
-    found = []
+    info, found = capture.info, []
     for frame in frames:
         row = fitted.index(frame)
-        biased, canonical = (
-            _drawn(model, clip, row, capture, avatar.settings.heads, biases=on)
-            for on in (True, False)
-        )
-        mask = capture.mask(frame)[..., None] / 255.0
-        found.append(
-            Explanation(
-                frame, float(omegas[row]), capture.frame(frame) / 255.0 * mask, canonical, biased
+        pictures = []
+        for biases in (False, True):
+            kept = {side: torch.tensor([biases]) for side in model.perturbation}
+            drawing = model.draw_frames(
+                clip,
+                torch.tensor([row]),
+                info.width,
+                info.height,
+                kept=kept,
+                move=True,
+                refine=avatar.settings.heads,
             )
-        )
+            image = drawing.image[0] if biases else drawing.image[0] / model.log_gains[row].exp()
+            pictures.append(image.clamp(0.0, 1.0).numpy())
+        seen = capture.frame(frame) / 255.0 * (capture.mask(frame)[..., None] / 255.0)
+        found.append(Explanation(frame, float(omegas[row]), seen, *pictures))
     return found
 
 
@@ -166,11 +171,10 @@ def temporal_weights(
 def explanation_sheet(
     found: Sequence[Explanation], names: Mapping[int, str] | None = None
 ) -> np.ndarray:
-    """A sheet with a row for each frame.
+    """A sheet (H, W, 3) uint8 with a row for each frame.
 
-    Returns:
-        (H, W, 3) uint8: frame, without biases, with biases, and the difference of the two, grey
-        where there is none.
+    It shows the frame, the hand without biases and with them, and the difference of the two, grey
+    where there is none.
     """
     tiles = []
     for item in found:
@@ -184,24 +188,3 @@ def explanation_sheet(
         ):
             tiles.append(labelled(as_uint8(np.clip(picture, 0.0, 1.0).astype(np.float32)), caption))
     return sheet(tiles, 4)
-
-
-def _drawn(
-    model: WildGHandModel,
-    clip: TrainingClip,
-    row: int,
-    capture: Capture,
-    refine: bool,
-    *,
-    biases: bool,
-) -> np.ndarray:
-    rows = torch.tensor([row])
-    kept = {side: torch.tensor([biases]) for side in model.perturbation}
-    info = capture.info
-    drawing = model.draw_frames(
-        clip, rows, info.width, info.height, kept=kept, move=True, refine=refine
-    )
-    image = drawing.image[0]
-    if not biases:
-        image = image / model.log_gains[row].exp()
-    return image.clamp(0.0, 1.0).numpy()

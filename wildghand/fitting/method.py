@@ -18,14 +18,11 @@ from wildghand.fitting.components import make_fit
 from wildghand.gaussians.attributes import CHANNELS, Activation, RawAttributes
 from wildghand.gaussians.fit_loop import ready_device
 from wildghand.gaussians.perceptual import Vgg19
-from wildghand.gaussians.regularizers import off_surface, sum_bags
 from wildghand.gaussians.rig import AnchorPoses
-from wildghand.gaussians.shading import fill_harmonics
 from wildghand.light import Obstacles
 from wildghand.model.dress import dress
 from wildghand.model.settings import WildGHandSettings, read_settings
 from wildghand.network import NetworkOutput, Refinement
-from wildghand.network.frame_heads import warm_up_heads as warm_up_heads
 from wildghand.pao.sam import check_checkpoint
 from wildghand.plain.loop import run_fit
 from wildghand.splat.threads import denormals_flushed
@@ -121,11 +118,6 @@ def _warm_up() -> None:
     gaussians, size = dress(anchors, prediction, Activation(), perturbation, torch.ones(1))
     assert size is not None
     (gaussians.means.sum() + size).backward()
-    off_surface(prediction.raw, Activation(), 1.0)
-    first = zeros(1, dtype=torch.int64)
-    sum_bags(zeros(1, 1), first, zeros(1), first)
-    fill_harmonics(zeros(1, 3), 1, zeros(1, 3), 0)
-    warm_up_heads()
     # Shadows are cast by rays.
     corner = np.eye(3)
     Obstacles([(corner, np.array([[0, 1, 2]]))]).free(corner, corner, corner)

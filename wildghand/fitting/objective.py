@@ -92,8 +92,8 @@ class Regularisers(Component):
                 )
                 yield settings.surface * off
             rough = weights.laplacian_scales, weights.laplacian_colors
-            if any(rough):  # one product with the Laplacian
-                yield attribute_roughness(self._laplacians[side], raw.concatenate(), *rough)
+            if any(rough):
+                yield attribute_roughness(self._laplacians[side], raw, *rough)
 
     def loss_of_features(self, fit: Fit, features: Features) -> Tensor | None:
         """Smooth offsets of the template (head iii), and like texture of both hands."""

@@ -1,20 +1,19 @@
-"""Parts of the loop of every fit: device, budget, batches, threads, a guard on the loss."""
+"""Parts of the loop of every fit: device, budget, batches, threads."""
 
 from __future__ import annotations
 
 import contextlib
 import importlib.util
-import math
 import os
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
 
-from hwp_bench.base.errors import DidNotConverge, MissingDependency
+from hwp_bench.base.errors import MissingDependency
 from hwp_bench.base.numerics import count_is_chosen
 from hwp_bench.methods.contract import Budget, Report
 from wildghand.gaussians.adam import ClippedAdam
@@ -105,15 +104,8 @@ class StepThreads:
             self._plan = [None] * HELD
 
 
-#: Steps over which the loss is averaged before it is judged.
-WINDOW = 50
-#: A mean loss of a window beyond this multiple of the best one means divergence.
-MAX_RISE = 3.0
-
 #: The loss of a step: a number, or a scalar on a device, which nobody has waited for yet.
 Loss = float | torch.Tensor
-Snapshot = TypeVar("Snapshot", covariant=True)
-Kept = TypeVar("Kept")
 
 
 def _warm_up() -> None:
@@ -200,85 +192,3 @@ def batches(count: int, batch: int, seed: int) -> Iterator[torch.Tensor]:
             queue = np.concatenate((queue, random.permutation(count)))
         yield torch.from_numpy(queue[:batch])
         queue = queue[batch:]
-
-
-def read_losses(losses: Sequence[Loss]) -> list[float]:
-    """The losses of some steps as numbers; waits once for those that are on a device."""
-    held = [loss for loss in losses if isinstance(loss, torch.Tensor)]
-    numbers = iter(torch.stack(held).tolist() if held else ())
-    return [next(numbers) if isinstance(loss, torch.Tensor) else loss for loss in losses]
-
-
-class Fitted(Protocol[Snapshot]):
-    """A model that is being fitted."""
-
-    def finite(self) -> bool:
-        """Whether every fitted number is finite."""
-        ...
-
-    def snapshot(self) -> Snapshot:
-        """A copy of the state that the fit no longer changes."""
-        ...
-
-
-class Guard(Generic[Kept]):
-    """Watches the loss of a fit.
-
-    Attributes:
-        step: steps behind the state that is kept; 0 while there is none.
-    """
-
-    def __init__(self) -> None:
-        self.step = 0
-        self._best_loss = math.inf
-        self._best: Kept | None = None
-        self._losses: list[Loss] = []
-
-    def watch(self, step: int, loss: Loss, model: Fitted[Kept]) -> bool:
-        """Take note of the loss of `model` after `step` steps; False means divergence.
-
-        A loss that is on a device is looked at when its window ends. The steps until then are not
-        kept if it turns out not to be finite.
-        """
-        if not isinstance(loss, torch.Tensor) and not math.isfinite(loss):
-            return False
-        self._losses.append(loss)
-        if len(self._losses) < WINDOW:
-            return True
-        losses = read_losses(self._losses)
-        mean = sum(losses) / len(losses)
-        self._losses.clear()
-        if not math.isfinite(mean) or not model.finite():
-            return False
-        if mean < self._best_loss:
-            self._best_loss, self._best, self.step = mean, model.snapshot(), step
-        return mean <= MAX_RISE * self._best_loss
-
-    def sound(self, model: Fitted[Kept]) -> bool:
-        """Whether the model and the losses since the last window are finite, when a fit ends."""
-        return all(map(math.isfinite, read_losses(self._losses))) and model.finite()
-
-    def best(self) -> Kept:
-        """The state with the lowest loss; `DidNotConverge` if there was none."""
-        if self._best is None:
-            raise DidNotConverge(
-                f"the fit diverged within its first {WINDOW} steps",
-                remedy="Lower the learning rates, or check the capture's hand parameters.",
-            )
-        return self._best
-
-    def state_dict(self) -> dict[str, Any]:
-        """The state for `load_state_dict`."""
-        return {
-            "step": self.step,
-            "best_loss": self._best_loss,
-            "best": self._best,
-            "losses": read_losses(self._losses),
-        }
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from a saved state."""
-        self.step = int(state["step"])
-        self._best_loss = float(state["best_loss"])
-        self._best = state["best"]
-        self._losses = [float(loss) for loss in state["losses"]]

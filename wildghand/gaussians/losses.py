@@ -1,4 +1,4 @@
-"""Losses on images: SSIM with a closed-form gradient, and L1 + D-SSIM under pixel weights.
+"""Losses on images: SSIM, and L1 + D-SSIM under pixel weights.
 
 On the CPU, float32, loss and gradient are made in one go in a tenth of torch's time, row by row and
 16 numbers at a time. A row of an image is W x C numbers, channel after channel. Sums over the rows
@@ -20,8 +20,7 @@ import torch
 from numba import types
 
 from hwp_bench.base.errors import ShapeMismatch
-from hwp_bench.base.kernels import compiled
-from wildghand.splat.kernels.jit import inline, next_job
+from wildghand.splat.kernels.jit import inline, jobs, kernel
 from wildghand.splat.kernels.vectors import (
     Vector,
     absolute,
@@ -32,7 +31,7 @@ from wildghand.splat.kernels.vectors import (
     select,
     store,
 )
-from wildghand.splat.threads import even_jobs, kernels_take, run, thread_count
+from wildghand.splat.threads import kernels_take, run_jobs
 
 #: Numbers that are worked on together; a row must have as many.
 LANES = 16
@@ -40,6 +39,10 @@ LANES = 16
 #: Edge of the SSIM window, px.
 WINDOW = 11
 _HALF = WINDOW // 2
+#: Its standard deviation, px.
+SIGMA = 1.5
+#: Stabilisers (0.01 L)^2 and (0.03 L)^2 for a data range L of 1.
+C1, C2 = 0.01**2, 0.03**2
 _ALL = 2**LANES - 1
 _ZERO, _ONE, _TWO = np.float32(0.0), np.float32(1.0), np.float32(2.0)
 _FLOATS = Vector(types.float32, LANES)
@@ -75,7 +78,7 @@ class Made(NamedTuple):
     factors: np.ndarray  # (3, B, H, W * C) float32; blurred, they make the gradient of SSIM
 
 
-@compiled(nogil=True)
+@kernel
 def find_content(worker, counters, ends, x, y, channels, content):
     """The part of each image outside of which both images are zero; a job is an image.
 
@@ -84,10 +87,7 @@ def find_content(worker, counters, ends, x, y, channels, content):
     """
     height, size = x.shape[1:]
     seen = np.empty(size, np.bool_)
-    while True:
-        image = next_job(worker, counters, ends)
-        if image < 0:
-            break
+    for image in jobs(worker, counters, ends):
         seen[:] = False
         top, bottom = height, 0
         for row in range(height):
@@ -195,7 +195,7 @@ def _compare_row(images, at, first, last, channels, constants, blurred, spread, 
         store(made.factors, 2 * plane + at + j, scale * (a1 * inverse) * (-_TWO))
 
 
-@compiled(nogil=True)
+@kernel
 def compare(worker, counters, ends, images, channels, constants, made):
     """Errors of every row, and what their gradient is made of; a job is a row of an image.
 
@@ -208,10 +208,7 @@ def compare(worker, counters, ends, images, channels, constants, made):
     spread, errors = np.empty(size, np.float32), np.empty(size, np.float32)
     # What rounding leaves of a pixel that is black in both.
     black = (_ONE - c1 * c2 * (_ONE / (c1 * c2))) * lambda_ * np.float32(channels)
-    while True:
-        job = next_job(worker, counters, ends)
-        if job < 0:
-            break
+    for job in jobs(worker, counters, ends):
         image, row = job // height, job % height
         weights, line = images.weights[image, row], made.errors[image, row]
         top, bottom, first, last = _grown(images.content, image, height, size, channels, _HALF)
@@ -237,7 +234,7 @@ def compare(worker, counters, ends, images, channels, constants, made):
         made.sums[image, row] = found
 
 
-@compiled(nogil=True)
+@kernel
 def gather(worker, counters, ends, images, channels, window, made, gradient):
     """The gradient by x. The window is symmetric and the border zero: it is its own adjoint.
 
@@ -248,10 +245,7 @@ def gather(worker, counters, ends, images, channels, window, made, gradient):
     pad = 2 * _HALF * channels
     blurred = np.empty((3, size + 2 * pad), np.float32)
     stride, plane = blurred.shape[1], made.direct.size
-    while True:
-        job = next_job(worker, counters, ends)
-        if job < 0:
-            break
+    for job in jobs(worker, counters, ends):
         image, row = job // height, job % height
         gradient[image, row] = _ZERO
         top, bottom, first, last = _grown(images.content, image, height, size, channels, _HALF)
@@ -288,12 +282,6 @@ def gather(worker, counters, ends, images, channels, window, made, gradient):
 _VALUES_LIKE_A_PAIR = 4
 
 
-def takes(prediction: torch.Tensor, *others: torch.Tensor) -> bool:
-    """Whether these images, (B, H, W, C), and their weights can be compared here."""
-    wide = prediction.shape[2] * prediction.shape[3] >= LANES
-    return wide and kernels_take(prediction, *others)
-
-
 class PhotometricCpu(torch.autograd.Function):
     """See `wildghand.gaussians.losses.photometric_loss`, which checks the arguments."""
 
@@ -304,8 +292,6 @@ class PhotometricCpu(torch.autograd.Function):
         target: torch.Tensor,
         weights: torch.Tensor,
         dssim_weight: float,
-        window: np.ndarray,
-        stabilisers: tuple[float, float],
     ) -> torch.Tensor:
         """Return the scalar loss; the gradients are made along with it."""
         count, height, width, channels = prediction.shape
@@ -314,10 +300,8 @@ class PhotometricCpu(torch.autograd.Function):
             np.ascontiguousarray(tensor.detach().numpy())
             for tensor in (prediction, target, weights)
         )
-        constants = Constants(
-            np.asarray(window, np.float32),
-            *(np.float32(value) for value in (dssim_weight, *stabilisers, x.size)),
-        )
+        window = _window().astype(np.float32)
+        constants = Constants(window, *map(np.float32, (dssim_weight, C1, C2, x.size)))
         images = Images(x.reshape(rows), y.reshape(rows), w, np.empty((count, 4), np.int64))
         made = Made(
             np.empty(w.shape, np.float32),
@@ -325,22 +309,13 @@ class PhotometricCpu(torch.autograd.Function):
             np.empty(rows, np.float32),
             np.empty((3, *rows), np.float32),
         )
-        run(
-            find_content,
-            even_jobs(count, thread_count(count, x.size // (4 * _VALUES_LIKE_A_PAIR))),
-            images.x,
-            images.y,
-            channels,
-            images.content,
-        )
-        jobs = even_jobs(
-            count * height, thread_count(count * height, x.size // _VALUES_LIKE_A_PAIR)
-        )
-        run(compare, jobs, images, channels, constants, made)
+        work = x.size // _VALUES_LIKE_A_PAIR
+        run_jobs(find_content, count, work // 4, images.x, images.y, channels, images.content)
+        run_jobs(compare, count * height, work, images, channels, constants, made)
         if ctx.needs_input_grad[0]:
-            gradient = np.empty_like(x)
-            run(gather, jobs, images, channels, constants.window, made, gradient.reshape(rows))
-            ctx.gradient = gradient
+            ctx.gradient = np.empty_like(x)
+            gradient = ctx.gradient.reshape(rows)
+            run_jobs(gather, count * height, work, images, channels, window, made, gradient)
         ctx.save_for_backward(torch.from_numpy(made.errors))
         ctx.count = x.size
         return torch.tensor(made.sums.sum() / x.size, dtype=torch.float32)
@@ -355,13 +330,7 @@ class PhotometricCpu(torch.autograd.Function):
             to_prediction = torch.from_numpy(ctx.gradient) * upstream
         if ctx.needs_input_grad[2]:
             to_weights = errors * (upstream / ctx.count)
-        return to_prediction, None, to_weights, None, None, None
-
-
-#: Standard deviation of the SSIM window, px.
-SIGMA = 1.5
-#: Stabilisers (0.01 L)^2 and (0.03 L)^2 for a data range L of 1.
-C1, C2 = 0.01**2, 0.03**2
+        return to_prediction, None, to_weights, None
 
 
 def ssim_map(prediction: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
@@ -385,7 +354,14 @@ def ssim_map(prediction: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     similarity", equation 13; zero padding as in 3DGS.
     """
     _same_shape(prediction, target, "target")
-    return _SsimMap.apply(full_precision(prediction), full_precision(target))
+    x, y = full_precision(prediction), full_precision(target).detach()
+    means = _blur(torch.cat((x, y, x * x, y * y, x * y), dim=-1))
+    mu_x, mu_y, xx, yy, xy = means.split(x.shape[-1], dim=-1)
+    products, squares = mu_x * mu_y, mu_x * mu_x + mu_y * mu_y
+    # Rounding may push a variance below 0; the sum must stay away from it.
+    spreads = (xx + yy - squares).clamp(min=0.0)
+    above = (2.0 * products + C1) * (2.0 * (xy - products) + C2)
+    return above / ((squares + C1) * (spreads + C2))
 
 
 def photometric_loss(
@@ -418,14 +394,11 @@ def photometric_loss(
             f"has shape {tuple(weights.shape)}, expected {tuple(prediction.shape[:3])}",
             field="weights",
         )
-    prediction, target, weights = (
-        full_precision(prediction),
-        full_precision(target),
-        full_precision(weights),
-    )
-    images = (prediction, target, weights)
-    if dssim_weight > 0.0 and prediction.device.type == "cpu" and takes(*images):
-        return PhotometricCpu.apply(*images, dssim_weight, _window(), (C1, C2))
+    images = [full_precision(tensor) for tensor in (prediction, target, weights)]
+    prediction, target, weights = images
+    wide = prediction.shape[2] * prediction.shape[3] >= LANES
+    if dssim_weight > 0.0 and wide and kernels_take(*images):
+        return PhotometricCpu.apply(*images, dssim_weight)
     error = (prediction - target).abs()
     if dssim_weight > 0.0:
         dissimilarity = 1.0 - ssim_map(prediction, target)
@@ -438,61 +411,11 @@ def full_precision(values: torch.Tensor) -> torch.Tensor:
     return values.float() if values.element_size() < 4 else values
 
 
-class _SsimMap(torch.autograd.Function):
-    """SSIM and its derivative; autograd's own would blur twice as often and keep twice as much."""
-
-    @staticmethod
-    def forward(ctx: Any, prediction: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-        x, y = prediction.detach(), target.detach()
-        channels = x.shape[-1]
-        stack = torch.cat((x, y, x * x, y * y, x * y), dim=-1)
-        mu_x, mu_y, xx, yy, xy = _blur(stack).split(channels, dim=-1)
-        mu_xx, mu_yy, mu_xy = mu_x * mu_x, mu_y * mu_y, mu_x * mu_y
-        a1 = 2.0 * mu_xy + C1
-        a2 = 2.0 * (xy - mu_xy) + C2
-        b1 = mu_xx + mu_yy + C1
-        # Rounding may push a variance below 0; the sum must stay away from it.
-        b2 = (xx - mu_xx + yy - mu_yy).clamp(min=0.0) + C2
-        inverse = 1.0 / (b1 * b2)
-        ssim = a1 * a2 * inverse
-        ctx.save_for_backward(x, y, mu_x, mu_y, a1, a2, b1, b2, inverse, ssim)
-        return ssim
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor, None]:
-        x, y, mu_x, mu_y, a1, a2, b1, b2, inverse, ssim = ctx.saved_tensors
-        channels = x.shape[-1]
-        to_mu = 2.0 * (mu_y * (a2 - a1) * inverse - mu_x * ssim * (1.0 / b1 - 1.0 / b2))
-        to_xx = -ssim / b2
-        to_xy = 2.0 * a1 * inverse
-        stack = torch.cat((gradient * to_mu, gradient * to_xx, gradient * to_xy), dim=-1)
-        # The window is symmetric and the border zero: blurring is its own adjoint.
-        from_mu, from_xx, from_xy = _blur(stack).split(channels, dim=-1)
-        return from_mu + 2.0 * x * from_xx + y * from_xy, None
-
-
 def _blur(images: torch.Tensor) -> torch.Tensor:
     """Blur (B, H, W, C) with the SSIM window over a zero border."""
-    if images.device.type != "cpu":
-        return _convolve(images)
-    import cv2
-
-    # An order of magnitude faster on a CPU than torch's convolution of single channels.
-    source = np.ascontiguousarray(images.numpy())
-    blurred = np.empty_like(source)
-    window = _window()
-    for image, out in zip(source, blurred, strict=True):
-        cv2.sepFilter2D(image, -1, window, window, dst=out, borderType=cv2.BORDER_CONSTANT)
-    return torch.from_numpy(blurred)
-
-
-def _convolve(images: torch.Tensor) -> torch.Tensor:
     window = _window_on(images.device, images.dtype)
-    channels = images.shape[-1]
-    half = WINDOW // 2
-    planes = images.permute(0, 3, 1, 2)
-    for size, padding in (((WINDOW, 1), (half, 0)), ((1, WINDOW), (0, half))):
+    channels, planes = images.shape[-1], images.permute(0, 3, 1, 2)
+    for size, padding in (((WINDOW, 1), (_HALF, 0)), ((1, WINDOW), (0, _HALF))):
         kernel = window.reshape(1, 1, *size).expand(channels, 1, *size)
         planes = torch.nn.functional.conv2d(planes, kernel, padding=padding, groups=channels)
     return planes.permute(0, 2, 3, 1)
@@ -500,7 +423,7 @@ def _convolve(images: torch.Tensor) -> torch.Tensor:
 
 @functools.cache
 def _window() -> np.ndarray:
-    places = np.arange(WINDOW) - WINDOW // 2
+    places = np.arange(WINDOW) - _HALF
     window = np.exp(-0.5 * (places / SIGMA) ** 2)
     return window / window.sum()
 

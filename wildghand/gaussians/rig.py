@@ -19,11 +19,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hwp_bench.base.kernels import compiled, helper
+from hwp_bench.base.kernels import helper
 from hwp_bench.hands import HandTemplate, TemplateTensors, pose_hand
 from hwp_bench.hands.anchors import SurfaceAnchors, anchor_frames, anchor_positions, sample_surface
 from wildghand.gaussians.quaternions import matrix_to_quat
-from wildghand.splat.kernels.jit import next_job
+from wildghand.splat.kernels.jit import jobs, kernel
+from wildghand.splat.kernels.triples import by, cross, dot, get, minus, plus, put, times
 from wildghand.splat.threads import kernels_take, run_pieces
 
 #: Anchors that one thread places at a time.
@@ -51,7 +52,7 @@ def _factors(squared):
     return a, b, (math.cos(angle) - a) / (2.0 * squared), (0.5 * a - b) / squared
 
 
-@compiled(nogil=True)
+@kernel
 def chain(pose, rest, rotations, turns, shifts):
     """Forward kinematics of one frame.
 
@@ -67,15 +68,10 @@ def chain(pose, rest, rotations, turns, shifts):
         x, y, z = float(pose[j, 0]), float(pose[j, 1]), float(pose[j, 2])
         squared = x * x + y * y + z * z
         a, b, _, _ = _factors(squared)
-        rotations[j, 0, 0] = 1.0 + b * (x * x - squared)
-        rotations[j, 0, 1] = b * x * y - a * z
-        rotations[j, 0, 2] = b * x * z + a * y
-        rotations[j, 1, 0] = b * x * y + a * z
-        rotations[j, 1, 1] = 1.0 + b * (y * y - squared)
-        rotations[j, 1, 2] = b * y * z - a * x
-        rotations[j, 2, 0] = b * x * z - a * y
-        rotations[j, 2, 1] = b * y * z + a * x
-        rotations[j, 2, 2] = 1.0 + b * (z * z - squared)
+        xy, xz, yz = b * x * y, b * x * z, b * y * z
+        put(rotations[j], 0, (1.0 + b * (x * x - squared), xy - a * z, xz + a * y))
+        put(rotations[j], 1, (xy + a * z, 1.0 + b * (y * y - squared), yz - a * x))
+        put(rotations[j], 2, (xz - a * y, yz + a * x, 1.0 + b * (z * z - squared)))
         parent = 0 if j % 3 == 1 else j - 1
         for row in range(3):
             if j == 0:
@@ -99,7 +95,7 @@ def chain(pose, rest, rotations, turns, shifts):
             shifts[j, row] = shift
 
 
-@compiled(nogil=True)
+@kernel
 def chain_backward(pose, rest, rotations, turns, of_turns, of_shifts, of_rotations):
     """Gradients of `chain`, from those of turns and shifts.
 
@@ -159,7 +155,7 @@ def _rodrigues_backward(vector, g, out):
         out[row] = a * cross[row] + b * both + 2.0 * v[row] * (a_slope * of_a + b_slope * of_b)
 
 
-@compiled(nogil=True)
+@kernel
 def skin(rest, joint_of, weight_of, turns, shifts, vertices):
     """Linear blend skinning of one frame.
 
@@ -175,18 +171,18 @@ def skin(rest, joint_of, weight_of, turns, shifts, vertices):
                 matrices[j, row, column] = turns[j, row, column]
             matrices[j, row, 3] = shifts[j, row]
     for v in range(len(rest)):
-        x, y, z = rest[v, 0], rest[v, 1], rest[v, 2]
+        point = get(rest, v)
         a = b = c = np.float32(0.0)
         for k in range(joint_of.shape[1]):
             w = weight_of[v, k]
             m = matrices[joint_of[v, k]]
-            a += w * (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3])
-            b += w * (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3])
-            c += w * (m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3])
-        vertices[v, 0], vertices[v, 1], vertices[v, 2] = a, b, c
+            a += w * (dot(get(m, 0), point) + m[0, 3])
+            b += w * (dot(get(m, 1), point) + m[1, 3])
+            c += w * (dot(get(m, 2), point) + m[2, 3])
+        put(vertices, v, (a, b, c))
 
 
-@compiled(nogil=True)
+@kernel
 def skin_backward(of_points, corners, mix, rest, joint_of, weight_of, turns, of_rest):
     """Gradients of the skinning, from those of the anchors' positions in one frame.
 
@@ -202,75 +198,50 @@ def skin_backward(of_points, corners, mix, rest, joint_of, weight_of, turns, of_
     for n in range(len(of_points)):
         for corner in range(3):
             v, share = corners[n, corner], float(mix[n, corner])
-            of_vertices[v, 0] += share * of_points[n, 0]
-            of_vertices[v, 1] += share * of_points[n, 1]
-            of_vertices[v, 2] += share * of_points[n, 2]
+            for i in range(3):
+                of_vertices[v, i] += share * of_points[n, i]
     of_turns, of_shifts = np.zeros((16, 3, 3)), np.zeros((16, 3))
     for v in range(len(rest)):
-        a, b, c = of_vertices[v, 0], of_vertices[v, 1], of_vertices[v, 2]
-        x, y, z = float(rest[v, 0]), float(rest[v, 1]), float(rest[v, 2])
-        p = q = r = 0.0
-        if a != 0.0 or b != 0.0 or c != 0.0:
+        g, point = get(of_vertices, v), rest[v]
+        found = (0.0, 0.0, 0.0)
+        if g[0] != 0.0 or g[1] != 0.0 or g[2] != 0.0:
             for k in range(joint_of.shape[1]):
-                w, j = float(weight_of[v, k]), joint_of[v, k]
-                m, t, s = turns[j], of_turns[j], of_shifts[j]
-                wa, wb, wc = w * a, w * b, w * c
-                t[0, 0] += wa * x
-                t[0, 1] += wa * y
-                t[0, 2] += wa * z
-                t[1, 0] += wb * x
-                t[1, 1] += wb * y
-                t[1, 2] += wb * z
-                t[2, 0] += wc * x
-                t[2, 1] += wc * y
-                t[2, 2] += wc * z
-                s[0] += wa
-                s[1] += wb
-                s[2] += wc
-                p += m[0, 0] * wa + m[1, 0] * wb + m[2, 0] * wc
-                q += m[0, 1] * wa + m[1, 1] * wb + m[2, 1] * wc
-                r += m[0, 2] * wa + m[1, 2] * wb + m[2, 2] * wc
-        of_rest[v, 0], of_rest[v, 1], of_rest[v, 2] = p, q, r
+                j = joint_of[v, k]
+                share = by(g, float(weight_of[v, k]))
+                for row in range(3):
+                    for column in range(3):
+                        of_turns[j, row, column] += share[row] * float(point[column])
+                    of_shifts[j, row] += share[row]
+                m = turns[j]
+                found = plus(found, times(share, (get(m, 0), get(m, 1), get(m, 2))))
+        put(of_rest, v, found)
     return of_turns, of_shifts
 
 
-@compiled(nogil=True)
+@kernel
 def vertex_normals(vertices, faces, normals):
     """Unit normals (V, 3), faces weighed by area; (0, 0, 1) where there is no face of any area."""
     normals[:] = np.float32(0.0)
     for f in range(len(faces)):
-        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
-        ax, ay, az = (
-            vertices[j, 0] - vertices[i, 0],
-            vertices[j, 1] - vertices[i, 1],
-            vertices[j, 2] - vertices[i, 2],
-        )
-        bx, by, bz = (
-            vertices[k, 0] - vertices[i, 0],
-            vertices[k, 1] - vertices[i, 1],
-            vertices[k, 2] - vertices[i, 2],
-        )
-        x, y, z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
-        for v in (i, j, k):
-            normals[v, 0] += x
-            normals[v, 1] += y
-            normals[v, 2] += z
+        start = get(vertices, faces[f, 0])
+        edges = minus(get(vertices, faces[f, 1]), start), minus(get(vertices, faces[f, 2]), start)
+        normal = cross(*edges)
+        for v in faces[f]:
+            put(normals, v, plus(get(normals, v), normal))
     for v in range(len(normals)):
-        x, y, z = _unit(normals[v, 0], normals[v, 1], normals[v, 2])
-        normals[v, 0], normals[v, 1], normals[v, 2] = x, y, z
+        put(normals, v, _unit(get(normals, v)))
 
 
 @helper
-def _unit(x, y, z):
+def _unit(a):
     """The direction of a vector; (0, 0, 1) of none."""
-    squared = x * x + y * y + z * z
+    squared = dot(a, a)
     if squared > _TINY:
-        scale = np.float32(1.0) / np.sqrt(squared)
-        return x * scale, y * scale, z * scale
+        return by(a, np.float32(1.0) / np.sqrt(squared))
     return np.float32(0.0), np.float32(0.0), np.float32(1.0)
 
 
-@compiled(nogil=True)
+@kernel
 def place_anchors(
     worker, counters, ends, vertices, normals, transl, corners, first_edge, mix, positions,
     orientations,
@@ -283,41 +254,28 @@ def place_anchors(
         positions: (N, 3) float32, filled, m.
         orientations: (N, 4) float32, filled: unit quaternions (w, x, y, z).
     """
-    job = next_job(worker, counters, ends)
-    while job >= 0:
+    for job in jobs(worker, counters, ends):
         for n in range(PIECE * job, min(PIECE * (job + 1), len(corners))):
-            px = py = pz = nx = ny = nz = np.float32(0.0)
+            position = normal = (np.float32(0.0), np.float32(0.0), np.float32(0.0))
             for corner in range(3):
                 v, share = corners[n, corner], mix[n, corner]
-                px += share * vertices[v, 0]
-                py += share * vertices[v, 1]
-                pz += share * vertices[v, 2]
-                nx += share * normals[v, 0]
-                ny += share * normals[v, 1]
-                nz += share * normals[v, 2]
-            positions[n, 0] = px + transl[0]
-            positions[n, 1] = py + transl[1]
-            positions[n, 2] = pz + transl[2]
-            nx, ny, nz = _unit(nx, ny, nz)
+                position = plus(position, by(get(vertices, v), share))
+                normal = plus(normal, by(get(normals, v), share))
+            put(positions, n, plus(position, (transl[0], transl[1], transl[2])))
+            normal = _unit(normal)
             i, j = first_edge[n, 0], first_edge[n, 1]
-            ex, ey, ez = (
-                vertices[j, 0] - vertices[i, 0],
-                vertices[j, 1] - vertices[i, 1],
-                vertices[j, 2] - vertices[i, 2],
-            )
-            along = ex * nx + ey * ny + ez * nz
-            ex, ey, ez = ex - along * nx, ey - along * ny, ez - along * nz
-            if not ex * ex + ey * ey + ez * ez > _TINY:
-                ex, ey, ez = _perpendicular(nx, ny, nz)
-            tx, ty, tz = _unit(ex, ey, ez)
-            bx, by, bz = ny * tz - nz * ty, nz * tx - nx * tz, nx * ty - ny * tx
-            _quaternion(tx, ty, tz, bx, by, bz, nx, ny, nz, orientations[n])
-        job = next_job(worker, counters, ends)
+            edge = minus(get(vertices, j), get(vertices, i))
+            edge = minus(edge, by(normal, dot(edge, normal)))
+            if not dot(edge, edge) > _TINY:
+                edge = _perpendicular(normal)
+            tangent = _unit(edge)
+            _quaternion(tangent, cross(normal, tangent), normal, orientations[n])
 
 
 @helper
-def _perpendicular(x, y, z):
+def _perpendicular(a):
     """A direction across a unit vector: across the axis that it is farthest from."""
+    x, y, z = a
     zero = np.float32(0.0)
     if abs(x) <= abs(y) and abs(x) <= abs(z):
         return zero, z, -y
@@ -327,12 +285,13 @@ def _perpendicular(x, y, z):
 
 
 @helper
-def _quaternion(tx, ty, tz, bx, by, bz, nx, ny, nz, out):
+def _quaternion(t, b, n, out):
     """Shepperd's quaternion of the rotation with the columns t, b and n."""
     one = np.float32(1.0)
-    squares = (one + tx + by + nz, one + tx - by - nz, one - tx + by - nz, one - tx - by + nz)
-    wx, wy, wz = bz - ny, nx - tz, ty - bx
-    xy, xz, yz = bx + ty, nx + tz, ny + bz
+    x, y, z = t[0], b[1], n[2]
+    squares = (one + x + y + z, one + x - y - z, one - x + y - z, one - x - y + z)
+    wx, wy, wz = b[2] - n[1], n[0] - t[2], t[1] - b[0]
+    xy, xz, yz = b[0] + t[1], n[0] + t[2], n[1] + b[2]
     best = 0
     for k in range(1, 4):
         if squares[k] > squares[best]:

@@ -1,69 +1,12 @@
 """Shading of a posed surface by its normals: low-order spherical harmonics of the light."""
 
-# Numba infers the types.
-# mypy: allow-untyped-defs
-
 from __future__ import annotations
 
 import math
 
-import numpy as np
 import torch
-from torch import Tensor
 
 from hwp_bench.base.errors import UsageError
-from hwp_bench.base.kernels import compiled
-from wildghand.splat.kernels.jit import next_job
-from wildghand.splat.threads import run_pieces
-
-#: Normals that one thread takes at a time.
-PIECE = 512
-
-_A, _B, _C, _D = (np.float32(math.sqrt(number)) for number in (15.0, 17.5, 10.5, 105.0))
-_THREE, _FIVE, _SEVEN = (np.float32(math.sqrt(number)) for number in (3.0, 5.0, 7.0))
-_HALF = np.float32(0.5)
-_ONE = np.float32(1.0)
-
-
-@compiled(nogil=True)
-def harmonics_kernel(worker, counters, ends, normals, degree, out, first):
-    """See `fill_harmonics`; a job is `PIECE` normals."""
-    three, five = np.float32(3.0), np.float32(5.0)
-    job = next_job(worker, counters, ends)
-    while job >= 0:
-        for row in range(PIECE * job, min(PIECE * (job + 1), len(normals))):
-            x, y, z = normals[row, 0], normals[row, 1], normals[row, 2]
-            o = out[row, first:]
-            o[0], o[1], o[2] = _THREE * x, _THREE * y, _THREE * z
-            if degree >= 2:
-                o[3], o[4], o[5] = _A * x * y, _A * y * z, _A * x * z
-                o[6] = _HALF * _A * (x * x - y * y)
-                o[7] = _HALF * _FIVE * (three * z * z - _ONE)
-            if degree >= 3:
-                fifth = five * z * z - _ONE
-                o[8] = _HALF * _B * y * (three * x * x - y * y)
-                o[9] = _D * x * y * z
-                o[10] = _HALF * _C * y * fifth
-                o[11] = _HALF * _SEVEN * z * (five * z * z - three)
-                o[12] = _HALF * _C * x * fifth
-                o[13] = _HALF * _D * z * (x * x - y * y)
-                o[14] = _HALF * _B * x * (x * x - three * y * y)
-        job = next_job(worker, counters, ends)
-
-
-def fill_harmonics(normals: Tensor, degree: int, out: Tensor, first: int) -> None:
-    """`sh_basis` of (M, 3) normals without the constant, into columns of `out` from `first` on."""
-    run_pieces(
-        harmonics_kernel,
-        len(normals),
-        PIECE,
-        len(normals),
-        normals.detach().contiguous().numpy(),
-        degree,
-        out.numpy(),
-        first,
-    )
-
 
 #: Highest degree of `sh_basis`.
 MAX_DEGREE = 3

@@ -17,16 +17,21 @@ from hwp_bench.base.records import flattened, merged
 from hwp_bench.methods.settings import check_source, choice, number, settings_from
 from wildghand.dpd.dpd import DpdSettings
 from wildghand.evidence import EvidenceSettings
-from wildghand.light import LightSettings, ShadowSettings
 from wildghand.model.terms import TermSettings
 from wildghand.network.settings import SIZES, NetworkSettings, network_settings
 from wildghand.pao.pao import PaoSettings
-from wildghand.poses.errors import PoseSettings
 from wildghand.prepass import PrepassSettings
-from wildghand.subject import SubjectSettings
 
 #: Where messages place a wrong setting.
 WHERE = "wildghand"
+
+
+@dataclass(frozen=True)
+class Switch:
+    """An addition whose numbers are constants beside their use."""
+
+    #: Whether it is a part of the fit.
+    enabled: bool = True
 
 
 @dataclass(frozen=True)
@@ -108,13 +113,13 @@ class WildGHandSettings:
     #: Component: template offsets (head iii) and refinement of the hand parameters (head iv).
     heads: bool = True
     #: Addition: given poses are corrected by what the clip's poses have in common.
-    poses: PoseSettings = field(default_factory=PoseSettings)
+    poses: Switch = field(default_factory=Switch)
     #: Addition: the template is bent to the person before the fit.
-    subject: SubjectSettings = field(default_factory=SubjectSettings)
+    subject: Switch = field(default_factory=Switch)
     #: Addition: a light for normals that no frame has shown.
-    light: LightSettings = field(default_factory=LightSettings)
+    light: Switch = field(default_factory=Switch)
     #: Addition: shadows that the hands cast on themselves and on each other.
-    shadows: ShadowSettings = field(default_factory=ShadowSettings)
+    shadows: Switch = field(default_factory=Switch)
     #: Addition: Gaussians that few frames show are discs on the skin.
     evidence: EvidenceSettings = field(default_factory=EvidenceSettings)
     #: Addition: the judge of the frames. It says where the temporal weights start, which pixels are
@@ -138,14 +143,12 @@ class WildGHandSettings:
 _BARE: Mapping[str, Any] = MappingProxyType(
     {
         "start_colors": False,
-        "poses": {"enabled": False},
-        "subject": {"enabled": False},
-        "light": {"enabled": False},
-        "shadows": {"enabled": False},
-        "evidence": {"enabled": False},
-        "prepass": {"enabled": False},
         "schedule": {"validated": False},
         "terms": {"surface": 0.0, "leave_hidden": False},
+        **{
+            name: {"enabled": False}
+            for name in ("poses", "subject", "light", "shadows", "evidence", "prepass")
+        },
     }
 )
 _PUBLISHED = merged(

@@ -101,12 +101,6 @@ class AttributeHead(nn.Module):
                 self.direct.weight.zero_()
                 self.direct.weight[:, :CHANNELS] = torch.diag(torch.tensor(DIRECT_GAINS))
 
-    def direct_weight(self) -> Tensor:
-        """(14, I) matrix of the direct path; (14, 0) without it."""
-        if self.direct is None:
-            return self.attributes.weight.new_zeros(CHANNELS, 0)
-        return self.direct.weight
-
     def forward(
         self, hidden: Tensor, x_g: Tensor | None, latent: Tensor, initial: Tensor
     ) -> RawAttributes:
@@ -139,11 +133,7 @@ class ShadowHead(nn.Module):
 
     def forward(self, x_g: Tensor) -> Tensor:
         """(B, N, Fg) to (B, N, 1) in (0, 1)."""
-        return self.activate(self.light(x_g) + self.detail(x_g))
-
-    def activate(self, logit: Tensor) -> Tensor:
-        """From a logit of any shape, 0 at the start, to (0, 1)."""
-        return torch.sigmoid(self.start + logit)
+        return torch.sigmoid(self.start + self.light(x_g) + self.detail(x_g))
 
 
 class TemplateHead(nn.Module):

@@ -13,7 +13,6 @@ from torch import Tensor, nn
 from hwp_bench.base.errors import ShapeMismatch, UsageError
 from wildghand.gaussians.attributes import Activation, RawAttributes
 from wildghand.network.branches import CompactGeometry, CompactTexture, PaperGeometry, PaperTexture
-from wildghand.network.frame_heads import frame_heads
 from wildghand.network.heads import (
     AttributeHead,
     IdentityMap,
@@ -187,8 +186,11 @@ class PredictionNetwork(nn.Module):
         """
         hand = self.features(side) if features is None else features
         with self._precision():
-            raw, shadow, mean = self._heads(side, normals, pose, hand.hidden)
-            pose_change, transl_change = self.refinement_head(hand.mean, mean)
+            x_g = self.geometry(side, normals, pose)
+            latent, initial = self._latent(side), self._initial(side)
+            raw = self.attribute_head(hand.hidden, x_g, latent, initial)
+            shadow = self.shadow_head(x_g)
+            pose_change, transl_change = self.refinement_head(hand.mean, x_g.mean(dim=1))
         if self.mixed_precision:
             raw = raw.map(torch.Tensor.float)
             shadow, pose_change, transl_change = (
@@ -215,30 +217,6 @@ class PredictionNetwork(nn.Module):
             return contextlib.nullcontext()
         device = next(self.parameters()).device
         return torch.autocast(device.type, torch.bfloat16)
-
-    def _heads(
-        self, side: str, normals: Tensor, pose: Tensor, hidden: Tensor
-    ) -> tuple[RawAttributes, Tensor, Tensor]:
-        """Heads (i) and (ii), and the (B, Fg) mean of the geometry features."""
-        branch = self.geometry_branch
-        plain = normals.dtype != torch.float32 or self.mixed_precision
-        if plain or not isinstance(branch, CompactGeometry) or self.settings.head_layers != 1:
-            x_g = self.geometry(side, normals, pose)
-            raw = self.attribute_head(hidden, x_g, self._latent(side), self._initial(side))
-            return raw, self.shadow_head(x_g), x_g.mean(dim=1)
-        chart = self._checked(side, normals, pose)
-        raw, shadow, mean = frame_heads(
-            branch,
-            self.attribute_head,
-            self.shadow_head,
-            coordinates=chart.coordinates,
-            normals=normals,
-            pose=pose,
-            hidden=hidden,
-            latent=self._latent(side),
-            initial=self._initial(side),
-        )
-        return RawAttributes.split(raw), shadow, mean
 
     def _latent(self, side: str) -> Tensor:
         """(N, I) identity features that the direct path reads; (N, 0) without it."""

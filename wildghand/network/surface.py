@@ -13,9 +13,7 @@ from torch.nn.functional import embedding_bag
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.hands import HandTemplate, SurfaceAnchors, anchor_uv
-from wildghand.gaussians.regularizers import sum_bags
 from wildghand.network.settings import NetworkSettings
-from wildghand.splat.threads import kernels_take
 
 #: Frequencies of a rest position: 3 coordinates x 3 frequencies x 2 = the authors' 18 numbers.
 POSITION_FREQUENCIES = 3
@@ -109,16 +107,8 @@ class _Gather(torch.autograd.Function):
 
 
 def _sum_bags(values: Tensor, index: Tensor, weight: Tensor, start: Tensor) -> Tensor:
-    on_cpu = all(tensor.device.type == "cpu" for tensor in (index, start))
-    if on_cpu and kernels_take(values, weight):
-        return sum_bags(values, index, weight, start)
-    return embedding_bag(
-        index,
-        values.contiguous(),
-        start,
-        mode="sum",
-        per_sample_weights=weight.to(values.dtype),
-    )
+    weights = weight.to(values.dtype)
+    return embedding_bag(index, values.contiguous(), start, mode="sum", per_sample_weights=weights)
 
 
 class PlaneSampler(FixedGather):

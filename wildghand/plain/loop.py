@@ -14,9 +14,14 @@ from typing import Any, Generic, TypeVar
 import torch
 
 from hwp_bench.base.console import notice
+from hwp_bench.base.errors import DidNotConverge
 from hwp_bench.methods.contract import Avatar, Budget, Report
-from wildghand.gaussians.fit_loop import Guard, Loss, StepThreads, read_losses, repeatable, spent
+from wildghand.gaussians.fit_loop import Loss, StepThreads, repeatable, spent
 
+#: Steps over which the loss is averaged before it is judged.
+WINDOW = 50
+#: A mean loss of a window beyond this multiple of the best one means divergence.
+MAX_RISE = 3.0
 #: Fall of the mean loss from window to window, as a share, that still counts as progress.
 PROGRESS = 1e-3
 
@@ -107,24 +112,99 @@ class IterativeFit(Generic[Result]):
 
 
 class Watchers:
-    """Guard and plateau: the watchers of the loss of a fit.
+    """Watches the loss of a fit: whether it diverges, and whether it stands still.
+
+    A loss that is on a device is looked at when its window ends. The steps until then are not kept
+    if it turns out not to be finite.
 
     Args:
-        plateau_steps: window of the plateau; 0 never stops early.
+        plateau_steps: window of the plateau; 0: never looked for.
+
+    Attributes:
+        step: steps behind the state that is kept; 0 while there is none.
     """
 
-    def __init__(self, plateau_steps: int) -> None:
-        self.guard: Guard[dict[str, torch.Tensor]] = Guard()
-        self.plateau = Plateau(plateau_steps)
+    def __init__(self, plateau_steps: int = 0) -> None:
+        self.step = 0
+        self._plateau_steps = plateau_steps
+        self._best: Any = None
+        self._best_loss = self._before = math.inf
+        self._losses: list[Loss] = []
+        self._plateau_losses: list[Loss] = []
+
+    def watch(self, step: int, loss: Loss, model: Any) -> bool:
+        """Take note of the loss after `step` steps; False means divergence.
+
+        The `model` says whether it is `finite`, and gives a `snapshot` of its state.
+        """
+        if not isinstance(loss, torch.Tensor) and not math.isfinite(loss):
+            return False
+        mean = _mean_of_window(self._losses, loss, WINDOW)
+        if mean is None:
+            return True
+        if not math.isfinite(mean) or not model.finite():
+            return False
+        if mean < self._best_loss:
+            self._best_loss, self._best, self.step = mean, model.snapshot(), step
+        return mean <= MAX_RISE * self._best_loss
+
+    def stands_still(self, loss: Loss) -> bool:
+        """Take note of a loss; True where a window is hardly lower than that before it."""
+        mean = _mean_of_window(self._plateau_losses, loss, self._plateau_steps)
+        if mean is None:
+            return False
+        before, self._before = self._before, mean
+        return mean > (1.0 - PROGRESS) * before
+
+    def sound(self) -> bool:
+        """Whether the losses since the last window are finite; to be asked when a fit ends."""
+        return all(map(math.isfinite, _read_losses(self._losses)))
+
+    def best(self) -> Any:
+        """The state with the lowest loss; `DidNotConverge` if there was none."""
+        if self._best is None:
+            raise DidNotConverge(
+                f"the fit diverged within its first {WINDOW} steps",
+                remedy="Lower the learning rates, or check the capture's hand parameters.",
+            )
+        return self._best
 
     def state_dict(self) -> dict[str, Any]:
         """The state for `load_state_dict`."""
-        return {"guard": self.guard.state_dict(), "plateau": self.plateau.state_dict()}
+        return {
+            "step": self.step,
+            "best": self._best,
+            "best_loss": self._best_loss,
+            "before": self._before,
+            "losses": _read_losses(self._losses),
+            "plateau_losses": _read_losses(self._plateau_losses),
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from a saved state."""
-        self.guard.load_state_dict(state["guard"])
-        self.plateau.load_state_dict(state["plateau"])
+        self.step, self._best = int(state["step"]), state["best"]
+        self._best_loss, self._before = float(state["best_loss"]), float(state["before"])
+        self._losses = [float(loss) for loss in state["losses"]]
+        self._plateau_losses = [float(loss) for loss in state["plateau_losses"]]
+
+
+def _mean_of_window(losses: list[Loss], loss: Loss, window: int) -> float | None:
+    """Add a loss to those of a window; their mean where that is full, which begins anew then."""
+    if not window:
+        return None
+    losses.append(loss)
+    if len(losses) < window:
+        return None
+    numbers = _read_losses(losses)
+    losses.clear()
+    return sum(numbers) / window
+
+
+def _read_losses(losses: list[Loss]) -> list[float]:
+    """The losses of some steps as numbers; waits once for those that are on a device."""
+    held = [loss for loss in losses if isinstance(loss, torch.Tensor)]
+    numbers = iter(torch.stack(held).tolist() if held else ())
+    return [next(numbers) if isinstance(loss, torch.Tensor) else loss for loss in losses]
 
 
 def run_fit(
@@ -158,7 +238,7 @@ def run_fit(
                 break
             with threads.step():
                 loss = fit.step(next(batches), fraction)
-            if not watchers.guard.watch(step + 1, loss, fit):
+            if not watchers.watch(step + 1, loss, fit):
                 step = _go_back(fit, watchers, step)
                 break
             step += 1
@@ -167,10 +247,10 @@ def run_fit(
             report(step, fit.checkpoint(step))
             if after_step is not None:
                 after_step(step, watchers, loss)
-            if watchers.plateau.reached(loss):
+            if watchers.stands_still(loss):
                 fit.tell(f"The loss has stood still for {fit.plateau_steps} steps; finished early.")
                 break
-        if not watchers.guard.sound(fit):
+        if not watchers.sound():
             step = _go_back(fit, watchers, step)
     return fit.finish(step, report.elapsed)
 
@@ -183,41 +263,7 @@ def _without_kept(budget: Budget, fit: IterativeFit[Any]) -> Budget:
 
 def _go_back(fit: IterativeFit[Any], watchers: Watchers, step: int) -> int:
     """Bring a fit that diverged back to its best state; returns the steps behind that."""
-    fit.restore(watchers.guard.best())
-    kept = watchers.guard.step
+    fit.restore(watchers.best())
+    kept = watchers.step
     fit.tell(f"The fit diverged at step {step}; the state of step {kept} is kept.")
     return kept
-
-
-class Plateau:
-    """Notices that the mean loss of a window is hardly lower than that of the window before.
-
-    Args:
-        window: steps of a window; 0 never notices.
-    """
-
-    def __init__(self, window: int) -> None:
-        self._window = window
-        self._losses: list[Loss] = []
-        self._before = math.inf
-
-    def reached(self, loss: Loss) -> bool:
-        """Take note of a loss; True when the fit may stop."""
-        if not self._window:
-            return False
-        self._losses.append(loss)
-        if len(self._losses) < self._window:
-            return False
-        mean = sum(read_losses(self._losses)) / self._window
-        self._losses.clear()
-        before, self._before = self._before, mean
-        return mean > (1.0 - PROGRESS) * before
-
-    def state_dict(self) -> dict[str, Any]:
-        """The state for `load_state_dict`."""
-        return {"losses": read_losses(self._losses), "before": self._before}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from a saved state."""
-        self._losses = [float(loss) for loss in state["losses"]]
-        self._before = float(state["before"])

@@ -12,14 +12,14 @@ from __future__ import annotations
 import functools
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 
 from hwp_bench.base.errors import MissingDependency
 from wildghand.splat import conventions as rules
-from wildghand.splat.scene import FlatScene, channels_with_depth
+from wildghand.splat.reference import rasterize_reference
+from wildghand.splat.scene import FlatScene
 
 #: Beyond this, squares of lengths leave float32 inside gsplat.
 _MAX_LENGTH = 1e15
@@ -43,8 +43,8 @@ def rasterize_gsplat(scene: FlatScene) -> tuple[torch.Tensor, torch.Tensor, dict
     Source: gsplat, `gsplat.rasterization` (Ye et al. 2024), version 1.5.2 or later.
     """
     rasterization = _gsplat()
-    if not scene.gaussians:
-        return _nothing(scene)
+    if not scene.gaussians:  # gsplat's kernels cannot be started
+        return rasterize_reference(scene)
     tensors = _harmless(scene)
     groups = max(tensors[name].shape[0] for name in ("means", "quats", "scales", "opacities"))
     options = scene.options
@@ -60,24 +60,6 @@ def rasterize_gsplat(scene: FlatScene) -> tuple[torch.Tensor, torch.Tensor, dict
         rasterize_mode="antialiased" if options.antialiased else "classic",
     )
     return channels.flatten(0, -4), alphas.flatten(0, -4), _info(scene, meta)
-
-
-def _nothing(scene: FlatScene) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
-    """Images without any Gaussian, for which gsplat's kernels cannot be started."""
-    options = scene.options
-    depths = scene.means.new_zeros(scene.images, 0)
-    channels, backgrounds = channels_with_depth(scene.colors, depths, scene)
-    size = channels.shape[-1]
-    if backgrounds is None:
-        backgrounds = scene.means.new_zeros(scene.images, size)
-    shape = (scene.images, options.height, options.width)
-    images = backgrounds[:, None, None].expand(*shape, size).contiguous()
-    meta = {
-        "means2d": scene.means.new_zeros(scene.images, 0, 2),
-        "depths": depths,
-        "radii": scene.means.new_zeros(scene.images, 0, 2, dtype=torch.int32),
-    }
-    return images, scene.means.new_zeros(*shape, 1), _info(scene, meta)
 
 
 def _info(scene: FlatScene, meta: dict[str, Any]) -> dict[str, Any]:
@@ -119,8 +101,9 @@ def _harmless(scene: FlatScene) -> dict[str, torch.Tensor]:
     result = {name: getattr(scene, name) for name in names}
     result["quats"], good = _usable(scene)
     neutral = _neutral(scene.means.device, scene.means.dtype)
+    zero = neutral["zero"]
     for name, mask in good.items():
-        result[name] = _replaced(result[name], mask, neutral.of(name, result[name]))
+        result[name] = _replaced(result[name], mask, neutral.get(name, zero))
     # An offender in any argument makes the Gaussian vanish: its opacity is zero.
     opacities = result["opacities"]
     colors = good.pop("colors")
@@ -133,13 +116,13 @@ def _harmless(scene: FlatScene) -> dict[str, torch.Tensor]:
     visible = torch.ones(finest, scene.gaussians, dtype=torch.bool, device=opacities.device)
     for mask in good.values():
         visible = visible & _repeat(mask, finest)
-    result["opacities"] = torch.where(visible, _repeat(opacities, finest), neutral.zero)
+    result["opacities"] = torch.where(visible, _repeat(opacities, finest), zero)
     if scene.backgrounds is not None:
         fine = scene.backgrounds.detach().abs() <= rules.MAX_COLOR
-        result["backgrounds"] = torch.where(fine, scene.backgrounds, neutral.zero)
+        result["backgrounds"] = torch.where(fine, scene.backgrounds, zero)
     cameras = _camera_usable(result["viewmats"].detach(), result["Ks"].detach())
     for name in ("viewmats", "Ks"):
-        result[name] = _replaced(result[name], cameras, neutral.of(name, result[name]))
+        result[name] = _replaced(result[name], cameras, neutral[name])
     return result
 
 
@@ -170,35 +153,24 @@ def _camera_usable(viewmats: torch.Tensor, Ks: torch.Tensor) -> torch.Tensor:
 
 
 def _replaced(tensor: torch.Tensor, good: torch.Tensor, value: torch.Tensor) -> torch.Tensor:
-    return torch.where(good.reshape(good.shape + (1,) * value.ndim), tensor, value)
-
-
-@dataclass(frozen=True)
-class _Neutral:
-    """What stands in for numbers that gsplat cannot take."""
-
-    zero: torch.Tensor
-    quats: torch.Tensor
-    #: A camera that has everything behind it.
-    viewmats: torch.Tensor
-    Ks: torch.Tensor
-
-    def of(self, name: str, tensor: torch.Tensor) -> torch.Tensor:
-        """The value for a row of an argument, or for a camera."""
-        if name in ("quats", "viewmats", "Ks"):
-            value: torch.Tensor = getattr(self, name)
-            return value
-        return self.zero if name == "opacities" else self.zero.expand(tensor.shape[-1])
+    return torch.where(good.reshape(good.shape + (1,) * (tensor.ndim - good.ndim)), tensor, value)
 
 
 @functools.lru_cache(maxsize=8)
-def _neutral(device: torch.device, dtype: torch.dtype) -> _Neutral:
-    """Made once for a device: each of these would start a kernel in every call."""
+def _neutral(device: torch.device, dtype: torch.dtype) -> dict[str, torch.Tensor]:
+    """What stands in for rows that gsplat cannot take, a camera's sees nothing; by argument.
+
+    Made once for a device: each of these would start a kernel in every call.
+    """
     away = torch.zeros(4, 4, dtype=dtype)
     away[2, 3], away[3, 3] = -1.0, 1.0
-    quats = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=dtype)
-    made = (torch.zeros((), dtype=dtype), quats, away, torch.eye(3, dtype=dtype))
-    return _Neutral(*(tensor.to(device) for tensor in made))
+    made = {
+        "zero": torch.zeros((), dtype=dtype),
+        "quats": torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=dtype),
+        "viewmats": away,
+        "Ks": torch.eye(3, dtype=dtype),
+    }
+    return {name: tensor.to(device) for name, tensor in made.items()}
 
 
 def _repeat(tensor: torch.Tensor, count: int) -> torch.Tensor:

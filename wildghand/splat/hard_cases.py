@@ -6,7 +6,7 @@ import functools
 import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -37,9 +37,7 @@ class HardScene:
 
     def changed(self, **arguments: torch.Tensor) -> HardScene:
         """The same scene with other tensors."""
-        return HardScene(
-            {**self.arguments, **arguments}, self.width, self.height, self.near_plane, self.eps2d
-        )
+        return replace(self, arguments={**self.arguments, **arguments})
 
     def without(self, index: int) -> HardScene:
         """The same scene without one Gaussian."""
@@ -325,15 +323,20 @@ def run_finite(scene: HardScene, context: Context) -> Measured:
     return Measured(drawing.finite, f"largest gradient {max(sizes):.0e}")
 
 
-_FLOAT32 = torch.finfo(torch.float32)
+_LARGEST = torch.finfo(torch.float32).max
 _SUBNORMAL = 1e-42
 _BAD = {"NaN": math.nan, "+inf": math.inf, "-inf": -math.inf}
+#: The second number of the spoilt Gaussian's row, its third, and the whole row.
+_ONE, _DEPTH, _ROW = (VICTIM, 1), (VICTIM, 2), (VICTIM,)
+#: Every Gaussian.
+_ALL = ()
 
 
 def cases() -> list[Case]:
     """Every hard case of the rasterizer, for the backends that this machine has."""
     backends = ("numba", "reference", *(["gsplat"] if _has_gsplat() else []))
-    return [Case(name, "splat", must_hold, run, backends) for name, must_hold, run in _catalogue()]
+    entries = (*_no_effects(), *_bad_views(), *_exact_scenes(), *_finite_scenes(), *_calls())
+    return [Case(name, "splat", must_hold, run, backends) for name, must_hold, run in entries]
 
 
 def _has_gsplat() -> bool:
@@ -345,154 +348,164 @@ def _has_gsplat() -> bool:
 _Entry = tuple[str, str, Callable[[Context], Measured]]
 
 
-def _catalogue() -> Iterator[_Entry]:
-    for entries in (_bad_values, _culled, _views, _shapes, _piles, _cameras, _calls, _extremes):
-        yield from entries()
+def _spoilt(argument: str, value: float, place: tuple[int, ...] = _ONE) -> HardScene:
+    """A hand with some numbers of an argument replaced."""
+    scene = hand_scene()
+    tensor = scene.arguments[argument].clone()
+    tensor[place[: tensor.ndim]] = value
+    return scene.changed(**{argument: tensor})
 
 
-def _bad_values() -> Iterator[_Entry]:
-    for argument in PER_GAUSSIAN:
-        for kind, value in _BAD.items():
-            yield _no_effect(f"{kind} in {argument}", _spoilt(hand_scene(), argument, value))
+def _no_effects() -> Iterator[_Entry]:
+    """A Gaussian that is not drawn: bad numbers, and where none is seen."""
     everything = hand_scene()
     for argument in PER_GAUSSIAN:
-        everything = _spoilt(everything, argument, math.nan)
-    yield _no_effect("NaN in every argument of a Gaussian", everything)
-
-
-def _culled() -> Iterator[_Entry]:
-    scene = hand_scene()
-    yield _no_effect("quaternion of zeros", _spoilt(scene, "quats", 0.0, whole=True))
-    at = {
-        "behind the camera": -0.6,
-        "on the camera plane": -0.4,
-        "nearer than the near plane": -0.395,
-        "far behind": -1e6,
-        "beyond the far plane": 2e10,
+        bad = _spoilt(argument, math.nan).arguments[argument]
+        everything = everything.changed(**{argument: bad})
+    scenes = {
+        f"{kind} in {argument}": _spoilt(argument, value)
+        for argument in PER_GAUSSIAN
+        for kind, value in _BAD.items()
+    } | {
+        "NaN in every argument of a Gaussian": everything,
+        "quaternion of zeros": _spoilt("quats", 0.0, _ROW),
+        "centre behind the camera": _spoilt("means", -0.6, _DEPTH),
+        "centre on the camera plane": _spoilt("means", -0.4, _DEPTH),
+        "centre nearer than the near plane": _spoilt("means", -0.395, _DEPTH),
+        "centre far behind": _spoilt("means", -1e6, _DEPTH),
+        "centre beyond the far plane": _spoilt("means", 2e10, _DEPTH),
+        "opacity 0": _spoilt("opacities", 0.0),
+        "opacity 0.001": _spoilt("opacities", 1e-3),
+        "opacity -0.5": _spoilt("opacities", -0.5),
+        f"opacity {-_LARGEST:g}": _spoilt("opacities", -_LARGEST),
+        "centre at the largest float32": _spoilt("means", _LARGEST),
+        "colour at the largest float32": _spoilt("colors", _LARGEST),
+        "scale at the largest float32": _spoilt("scales", _LARGEST),
     }
-    for name, z in at.items():
-        means = scene.arguments["means"].clone()
-        means[VICTIM, 2] = z
-        yield _no_effect(f"centre {name}", scene.changed(means=means))
-    for value in (0.0, 1e-3, -0.5, -_FLOAT32.max):
-        yield _no_effect(f"opacity {value:g}", _spoilt(scene, "opacities", value))
-    yield _no_effect("centre at the largest float32", _spoilt(scene, "means", _FLOAT32.max))
-    yield _no_effect("colour at the largest float32", _spoilt(scene, "colors", _FLOAT32.max))
-    yield _no_effect("scale at the largest float32", _spoilt(scene, "scales", _FLOAT32.max))
+    for name, scene in scenes.items():
+        run = functools.partial(run_no_effect, scene)
+        yield name, "finite; its gradient is zero; all else as without it", run
 
 
-def _views() -> Iterator[_Entry]:
+def _bad_views() -> Iterator[_Entry]:
     """Bad values in the arguments of one camera: the other camera's image must not change."""
-    for argument in ("viewmats", "Ks", "backgrounds"):
-        for kind, value in _BAD.items():
-            scene = hand_scene(cameras=2)
-            tensor = scene.arguments[argument].clone()
-            tensor.view(2, -1)[1, 0] = value
-            yield (
-                f"{kind} in {argument} of one camera",
-                "finite; its image shows the background, black if that is bad; the other as ever",
-                functools.partial(run_bad_view, scene.changed(**{argument: tensor})),
-            )
-    scene = hand_scene(cameras=2)
-    blind = scene.arguments["Ks"].clone()
-    blind[1, 0, 0] = 0.0
-    yield (
-        "focal length 0 in one camera",
-        "finite; its image shows the background; the other as ever",
-        functools.partial(run_bad_view, scene.changed(Ks=blind)),
-    )
+    values = [
+        (f"{kind} in {argument} of one camera", argument, value)
+        for argument in ("viewmats", "Ks", "backgrounds")
+        for kind, value in _BAD.items()
+    ]
+    for name, argument, value in (*values, ("focal length 0 in one camera", "Ks", 0.0)):
+        scene = hand_scene(cameras=2)
+        tensor = scene.arguments[argument].clone()
+        tensor.view(2, -1)[1, 0] = value
+        yield (
+            name,
+            "finite; its image shows the background, black if that is bad; the other as ever",
+            functools.partial(run_bad_view, scene.changed(**{argument: tensor})),
+        )
 
 
-def _shapes() -> Iterator[_Entry]:
+def _exact_scenes() -> Iterator[_Entry]:
+    """Scenes that are drawn as in float64.
+
+    A number is for gsplat's gradients where its float32 does not hold the tolerance; infinite: the
+    image is beyond it too, and its numbers must be finite, no more.
+    """
     scene = hand_scene()
-    yield _exact("opacity 1", _spoilt(scene, "opacities", 1.0))
-    yield _exact("opacity 1 + 1e-7", _spoilt(scene, "opacities", 1.0 + 1.2e-7))
-    yield _exact(
-        "opacity at the largest float32",
-        _spoilt(scene, "opacities", _FLOAT32.max),
-        gsplat=math.inf,
-    )
-    for value in (0.0, 1e-12, _SUBNORMAL, -0.01):
-        name = "subnormal" if value == _SUBNORMAL else f"{value:g}"
-        yield _exact(f"scale {name}", _spoilt(scene, "scales", value, whole=True))
-    yield _exact("scale 0 along one axis (a disc)", _spoilt(scene, "scales", 0.0))
-    yield _exact("scale 1e18", _spoilt(scene, "scales", 1e18, whole=True), gsplat=math.inf)
-    # An aspect of 1e20 leaves float64 no digit for the reference's gradient.
-    yield _finite("scale 1e18 along one axis", _spoilt(scene, "scales", 1e18))
-    yield _exact("scale 1 km along one axis", _spoilt(scene, "scales", 1e3), gsplat=math.inf)
-    yield _exact("quaternion of norm 1e-30", _rescaled(scene, 1e-30))
-    yield _exact("quaternion of norm 1e30", _rescaled(scene, 1e30))
-    yield _exact("subnormal centre", _spoilt(scene, "means", _SUBNORMAL))
-    yield _exact("subnormal colour", _spoilt(scene, "colors", _SUBNORMAL))
-    yield _finite("subnormal quaternion", _rescaled(scene, _SUBNORMAL))
-    yield _exact("colour 1e6", _spoilt(scene, "colors", 1e6))
+    means, scales = scene.arguments["means"], scene.arguments["scales"]
+    aside = {name: scene.arguments["viewmats"].clone() for name in ("half", "whole")}
+    aside["half"][:, 0, 3], aside["whole"][:, 0, 3] = -0.4 * 20 / 60, 50.0
     needles = hand_scene(count=20, width=150, height=150, focal=150.0, seed=1)
-    thin = needles.arguments["scales"].clone()
     pixel = 0.4 / 150.0
-    thin[:] = 1e-3 * pixel
-    thin[:, 0] = 300.0 * pixel
-    yield _exact(
-        "needles of 1e-3 x 300 px",
-        needles.changed(scales=thin),
-        NEEDLE_TOLERANCE,
-        gsplat=math.inf,
-    )
-
-
-def _piles() -> Iterator[_Entry]:
-    scene = hand_scene()
-    one_point = scene.arguments["means"].clone()
-    one_point[:] = one_point[0]
-    yield _exact(
-        "all Gaussians at one point", scene.changed(means=one_point), gsplat=GSPLAT_TOLERANCE
-    )
-    flat = scene.arguments["means"].clone()
-    flat[:, 2] = 0.0
-    yield _exact("identical depths (blended in order of index)", scene.changed(means=flat))
-    opaque = torch.ones_like(scene.arguments["opacities"])
-    big = 5.0 * scene.arguments["scales"]
-    yield _exact(
-        "alpha saturated everywhere",
-        scene.changed(opacities=opaque, scales=big),
-        gsplat=GSPLAT_TOLERANCE,
-    )
+    thin = torch.tensor([[300.0, 1e-3, 1e-3]], dtype=torch.float64).repeat(20, 1) * pixel
     layers = hand_scene(count=10_000, width=9, height=7, seed=3)
-    means = layers.arguments["means"].clone()
-    means[:, :2] = 0.0
-    yield _exact("10,000 layers on one pixel", layers.changed(means=means), gsplat=GSPLAT_TOLERANCE)
+    layers = layers.changed(means=layers.arguments["means"] * torch.tensor([0.0, 0.0, 1.0]))
     faint = torch.full_like(layers.arguments["opacities"], 0.0045)
-    yield _exact(
-        "10,000 faint layers, none saturating",
-        layers.changed(means=means, opacities=faint),
-        gsplat=GSPLAT_TOLERANCE,
-    )
+    edges = ((1, 1), (1, 50), (50, 1), (17, 33), (16, 16), (1, 4096), (4096, 1))
+    points = scene.changed(scales=torch.zeros_like(scales))
+    scenes: dict[str, tuple[HardScene, float | None]] = {
+        "opacity 1": (_spoilt("opacities", 1.0), None),
+        "opacity 1 + 1e-7": (_spoilt("opacities", 1.0 + 1.2e-7), None),
+        "opacity at the largest float32": (_spoilt("opacities", _LARGEST), math.inf),
+        "scale 0": (_spoilt("scales", 0.0, _ROW), None),
+        "scale 1e-12": (_spoilt("scales", 1e-12, _ROW), None),
+        "scale subnormal": (_spoilt("scales", _SUBNORMAL, _ROW), None),
+        "scale -0.01": (_spoilt("scales", -0.01, _ROW), None),
+        "scale 0 along one axis (a disc)": (_spoilt("scales", 0.0), None),
+        "scale 1e18": (_spoilt("scales", 1e18, _ROW), math.inf),
+        "scale 1 km along one axis": (_spoilt("scales", 1e3), math.inf),
+        "quaternion of norm 1e-30": (_rescaled(1e-30), None),
+        "quaternion of norm 1e30": (_rescaled(1e30), None),
+        "subnormal centre": (_spoilt("means", _SUBNORMAL), None),
+        "subnormal colour": (_spoilt("colors", _SUBNORMAL), None),
+        "colour 1e6": (_spoilt("colors", 1e6), None),
+        "needles of 1e-3 x 300 px": (needles.changed(scales=thin), math.inf),
+        "all Gaussians at one point": (
+            scene.changed(means=means[:1].expand_as(means)),
+            GSPLAT_TOLERANCE,
+        ),
+        "identical depths (blended in order of index)": (
+            scene.changed(means=means * torch.tensor([1.0, 1.0, 0.0])),
+            None,
+        ),
+        "alpha saturated everywhere": (
+            scene.changed(opacities=torch.ones(len(means)).double(), scales=5.0 * scales),
+            GSPLAT_TOLERANCE,
+        ),
+        "10,000 layers on one pixel": (layers, GSPLAT_TOLERANCE),
+        "10,000 faint layers, none saturating": (layers.changed(opacities=faint), GSPLAT_TOLERANCE),
+        "focal length 1e6 px from 6 km": (hand_scene(focal=1e6, distance=6e3, seed=2), None),
+        "focal length 1e-3 px": (hand_scene(focal=1e-3), GSPLAT_TOLERANCE),
+        "hand half off screen": (scene.changed(viewmats=aside["half"]), None),
+        "hand 3 cm in front of the camera": (hand_scene(distance=0.03), None),
+        "no Gaussian on screen": (scene.changed(viewmats=aside["whole"]), None),
+        "zero Gaussians": (
+            scene.changed(**{name: scene.arguments[name][:0] for name in PER_GAUSSIAN}),
+            None,
+        ),
+        **{f"image of {w} x {h}": (hand_scene(width=w, height=h), None) for w, h in edges},
+        "no low-pass filter": (HardScene(scene.arguments, near_plane=0.0, eps2d=0.0), None),
+        "no low-pass filter and scale 0": (HardScene(points.arguments, eps2d=0.0), None),
+    }
+    for name, (made, gsplat) in scenes.items():
+        own = NEEDLE_TOLERANCE if "needles" in name else GRADIENT_TOLERANCE
+        must_hold = f"image to {IMAGE_TOLERANCE:g}, gradients to {own:g} of float64, all finite"
+        if gsplat is not None:
+            must_hold += "; gsplat finite only" if math.isinf(gsplat) else f"; gsplat to {gsplat:g}"
+        allowed = own if gsplat is None else gsplat
+        yield name, must_hold, functools.partial(run_exact, made, own, allowed)
 
 
-def _cameras() -> Iterator[_Entry]:
-    far = hand_scene(focal=1e6, distance=6e3, seed=2)
-    yield _exact("focal length 1e6 px from 6 km", far)
-    yield _exact("focal length 1e-3 px", hand_scene(focal=1e-3), gsplat=GSPLAT_TOLERANCE)
-    yield _finite("focal length 1e-30 px", hand_scene(focal=1e-30))
-    yield _finite("focal length 1e30 px", hand_scene(focal=1e30))
-    half_off = hand_scene()
-    moved = half_off.arguments["viewmats"].clone()
-    moved[:, 0, 3] = -0.4 * 20 / 60
-    yield _exact("hand half off screen", half_off.changed(viewmats=moved))
-    yield _exact("hand 3 cm in front of the camera", hand_scene(distance=0.03))
-    aside = half_off.arguments["viewmats"].clone()
-    aside[:, 0, 3] = 50.0
-    yield _exact("no Gaussian on screen", half_off.changed(viewmats=aside))
-    empty = {name: half_off.arguments[name][:0] for name in PER_GAUSSIAN}
-    yield _exact("zero Gaussians", half_off.changed(**empty))
-    for width, height in ((1, 1), (1, 50), (50, 1), (17, 33), (16, 16), (1, 4096), (4096, 1)):
-        yield _exact(f"image of {width} x {height}", hand_scene(width=width, height=height))
-    unfiltered = hand_scene()
-    yield _exact("no low-pass filter", HardScene(unfiltered.arguments, near_plane=0.0, eps2d=0.0))
-    points = unfiltered.changed(scales=torch.zeros_like(unfiltered.arguments["scales"]))
-    yield _exact("no low-pass filter and scale 0", HardScene(points.arguments, eps2d=0.0))
+def _rescaled(norm: float) -> HardScene:
+    scene = hand_scene()
+    quats = scene.arguments["quats"].clone()
+    quats[VICTIM] *= norm / quats[VICTIM].norm()
+    return scene.changed(quats=quats.float().double())
+
+
+def _finite_scenes() -> Iterator[_Entry]:
+    """Scenes beyond the reference, whose numbers must be finite."""
+    scenes = {
+        # An aspect of 1e20 leaves float64 no digit for the reference's gradient.
+        "scale 1e18 along one axis": _spoilt("scales", 1e18),
+        "subnormal quaternion": _rescaled(_SUBNORMAL),
+        "focal length 1e-30 px": hand_scene(focal=1e-30),
+        "focal length 1e30 px": hand_scene(focal=1e30),
+    } | {
+        f"all of {argument} {name}": _spoilt(argument, value, _ALL)
+        for argument in PER_GAUSSIAN
+        for name, value in (
+            ("the largest float32", _LARGEST),
+            ("subnormal", _SUBNORMAL),
+            ("NaN", math.nan),
+        )
+    }
+    for name, scene in scenes.items():
+        yield name, "image and gradients finite", functools.partial(run_finite, scene)
 
 
 def _calls() -> Iterator[_Entry]:
+    """Calls that are unlike others in form."""
     for dtype in (torch.float16, torch.bfloat16):
         yield (
             f"arguments in {str(dtype).removeprefix('torch.')}",
@@ -515,59 +528,3 @@ def _calls() -> Iterator[_Entry]:
         f"finite; image and gradients to {GRADIENT_TOLERANCE:g} of the other order",
         run_reordered,
     )
-
-
-def _extremes() -> Iterator[_Entry]:
-    scene = hand_scene()
-    for argument in PER_GAUSSIAN:
-        for name, value in (("the largest float32", _FLOAT32.max), ("subnormal", _SUBNORMAL)):
-            whole = torch.full_like(scene.arguments[argument], value)
-            yield _finite(f"all of {argument} {name}", scene.changed(**{argument: whole}))
-        nothing = torch.full_like(scene.arguments[argument], math.nan)
-        yield _finite(f"all of {argument} NaN", scene.changed(**{argument: nothing}))
-
-
-def _spoilt(scene: HardScene, argument: str, value: float, whole: bool = False) -> HardScene:
-    """The scene with one number, or one whole row, of one Gaussian replaced."""
-    tensor = scene.arguments[argument].clone()
-    if whole or tensor.ndim == 1:
-        tensor[VICTIM] = value
-    else:
-        tensor[VICTIM, 1] = value
-    return scene.changed(**{argument: tensor})
-
-
-def _rescaled(scene: HardScene, norm: float) -> HardScene:
-    quats = scene.arguments["quats"].clone()
-    quats[VICTIM] *= norm / quats[VICTIM].norm()
-    return scene.changed(quats=quats.float().double())
-
-
-def _exact(
-    name: str,
-    scene: HardScene,
-    tolerance: float = GRADIENT_TOLERANCE,
-    gsplat: float | None = None,
-) -> _Entry:
-    """A scene that is drawn as in float64, gradients within `tolerance`.
-
-    `gsplat` is for its gradients where its float32 does not hold that; infinite: the image is
-    beyond it too, and its numbers must be finite, no more.
-    """
-    must_hold = f"image to {IMAGE_TOLERANCE:g}, gradients to {tolerance:g} of float64, all finite"
-    if gsplat is not None:
-        must_hold += "; gsplat finite only" if math.isinf(gsplat) else f"; gsplat to {gsplat:g}"
-    own = tolerance if gsplat is None else gsplat
-    return name, must_hold, functools.partial(run_exact, scene, tolerance, own)
-
-
-def _no_effect(name: str, scene: HardScene) -> _Entry:
-    return (
-        name,
-        "finite; its gradient is zero; all else as without it",
-        functools.partial(run_no_effect, scene),
-    )
-
-
-def _finite(name: str, scene: HardScene) -> _Entry:
-    return name, "image and gradients finite", functools.partial(run_finite, scene)

@@ -18,18 +18,19 @@ import psutil
 import torch
 
 from hwp_bench.base.errors import HwpError
+from hwp_bench.base.kernels import on_disk
 from wildghand.splat.kernels.blend import (
     BlendGradients,
+    TileScene,
     background_backward,
     blend,
     blend_backward,
     reduce_slots,
 )
-from wildghand.splat.kernels.groups import GROUP
-from wildghand.splat.kernels.jit import Kernel
-from wildghand.splat.kernels.lists import count_tiles, fill_tiles, place_tiles, sort_by_depth
+from wildghand.splat.kernels.lists import Walk, count_tiles, fill_tiles, place_tiles, sort_by_depth
 from wildghand.splat.kernels.project import (
     CAMERA,
+    GROUP,
     PIECE,
     Ellipsoids,
     PlaneGradients,
@@ -70,6 +71,12 @@ _MOST_CHUNKS = 32
 #: Pixels of the background's gradient that take as long as a (Gaussian, tile) pair.
 _PIXELS_LIKE_A_PAIR = 20
 
+#: Every kernel that a call runs.
+KERNELS: tuple[Any, ...] = (
+    prepare_cameras, project, sort_by_depth, count_tiles, place_tiles, fill_tiles, blend,
+    blend_backward, reduce_slots, background_backward, project_backward,
+)  # fmt: skip
+
 _log = logging.getLogger("wildghand.splat")
 _lock = threading.Lock()
 
@@ -106,6 +113,21 @@ class Call:
         size = float(o.width), float(o.height)
         return View(*size, o.near_plane, o.far_plane, o.eps2d, o.antialiased)
 
+    def tile_scene(self, colors: torch.Tensor) -> TileScene:
+        """What both passes over tiles read."""
+        images, gaussians = self.projected.depths.shape
+        shared = _gaussians(colors)
+        return TileScene(
+            start=self.lists.start,
+            entries=self.lists.entries,
+            geom=self.projected.geom.reshape(-1),
+            colors=shared.reshape(-1),
+            color_repeat=images // max(1, len(shared)),
+            width=self.options.width,
+            height=self.options.height,
+            gaussians=gaussians,
+        )
+
 
 def rasterize_numba(scene: FlatScene) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
     """Draws the scene, float32 on the CPU: channels (I, H, W, X), alphas, its part of `info`."""
@@ -119,14 +141,10 @@ def _draw(scene: FlatScene) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]
     given = (m.detach().double().contiguous().numpy() for m in (scene.viewmats, scene.Ks))
     prepare_cameras(*given, options.width, options.height, cameras)
     call = Call(options, cameras)
+    ellipsoids = (scene.means.contiguous(), scene.quats.contiguous(), scene.scales.contiguous())
+    looks = (scene.opacities.contiguous(), scene.colors.contiguous())
     means2d, shapes, depths, compensations = Project.apply(
-        scene.means.contiguous(),
-        scene.quats.contiguous(),
-        scene.scales.contiguous(),
-        scene.viewmats,
-        scene.opacities.contiguous(),
-        scene.colors.contiguous(),
-        call,
+        *ellipsoids, scene.viewmats, *looks, call
     )
     # The caller's tensor lies on the way, so that its gradient can be kept.
     info_means2d = unflattened(means2d, scene)
@@ -183,17 +201,9 @@ class Project(torch.autograd.Function):
             radii=lease((images, gaussians, 2), np.int32),
             compensations=lease((images, gaussians * call.options.antialiased), np.float32),
         )
-        run_jobs(
-            project,
-            images * max(1, gaussians // PIECE),
-            images * gaussians,
-            ellipsoids,
-            _gaussians(opacities),
-            _gaussians(colors),
-            call.cameras,
-            call.view,
-            projected,
-        )
+        looks = (_gaussians(opacities), _gaussians(colors))
+        jobs, work = images * max(1, gaussians // PIECE), images * gaussians
+        run_jobs(project, jobs, work, ellipsoids, *looks, call.cameras, call.view, projected)
         count = means.shape[1]
         geom = torch.from_numpy(projected.geom)[:, :count]
         # The values of `shapes` are never read: it is there for its gradient.
@@ -222,18 +232,11 @@ class Project(torch.autograd.Function):
         made = [_like_gaussians(tensor) for tensor in (means, quats, scales)]
         pieces, with_cameras = max(1, gaussians // PIECE), ctx.needs_input_grad[3]
         v_cameras = np.zeros((images, pieces if with_cameras else 0, 12))
-        run_jobs(
-            project_backward,
-            pieces,
-            images * gaussians,
-            Ellipsoids(_gaussians(means), _gaussians(quats), _gaussians(scales)),
-            call.cameras,
-            call.projected.depths,
-            call.view,
-            given,
-            Ellipsoids(*(_array(tensor) for tensor in made)),
-            v_cameras,
-        )
+        ellipsoids = Ellipsoids(_gaussians(means), _gaussians(quats), _gaussians(scales))
+        gradients = Ellipsoids(*(_array(tensor) for tensor in made))
+        seen = (call.cameras, call.projected.depths, call.view)
+        work = images * gaussians
+        run_jobs(project_backward, pieces, work, ellipsoids, *seen, given, gradients, v_cameras)
         v_viewmats = None
         if with_cameras:
             rows = torch.from_numpy(v_cameras.sum(1))
@@ -268,13 +271,9 @@ class Blend(torch.autograd.Function):
         run(
             blend,
             _tile_shares(call.lists.start),
-            call.lists.start,
-            call.lists.entries,
-            *_what_tiles_read(call, colors),
+            call.tile_scene(colors),
             _array(backgrounds),
-            _array(images).reshape(-1),
-            _array(alphas).reshape(-1),
-            call.remaining.reshape(-1),
+            *(array.reshape(-1) for array in (_array(images), _array(alphas), call.remaining)),
             call.stops,
             call.pairs,
             _kernel_channels(colors.shape[-1]),
@@ -305,29 +304,20 @@ class Blend(torch.autograd.Function):
         floats = slot_size(size, size in UNROLLED)
         slots = lease((int(looked_at.sum()), floats), np.float32)
         slot_of = lease((len(lists.entries),), np.int32)
+        read = (_array(images), call.remaining, upstream, _array(v_alphas.contiguous()), slots)
         run(
             blend_backward,
             _tile_shares(np.append(first_slot, len(slots))),
-            lists.start,
+            call.tile_scene(colors),
             call.stops,
             first_slot,
-            lists.entries,
-            *_what_tiles_read(call, colors),
-            _array(images).reshape(-1),
-            call.remaining.reshape(-1),
-            upstream.reshape(-1),
-            _array(v_alphas.contiguous()).reshape(-1),
-            slots.reshape(-1),
+            *(array.reshape(-1) for array in read),
             floats,
             slot_of,
             _kernel_channels(size),
         )
-        made = [
-            torch.empty(count, gaussians, 2),
-            torch.empty(count, gaussians, 3),
-            _like_gaussians(opacities),
-            _like_gaussians(colors),
-        ]
+        shapes = (torch.empty(count, gaussians, 2), torch.empty(count, gaussians, 3))
+        made = [*shapes, _like_gaussians(opacities), _like_gaussians(colors)]
         run_jobs(
             reduce_slots,
             max(1, gaussians // PIECE),
@@ -343,15 +333,9 @@ class Blend(torch.autograd.Function):
         v_backgrounds = None
         if ctx.needs_input_grad[4]:
             lines = np.empty((*upstream.shape[:2], size))
-            work = images.shape[:3].numel() // _PIXELS_LIKE_A_PAIR
-            run_jobs(
-                background_backward,
-                images.shape[:2].numel(),
-                work,
-                upstream,
-                call.remaining,
-                lines,
-            )
+            jobs, pixels = images.shape[:2].numel(), images.shape[:3].numel()
+            work = pixels // _PIXELS_LIKE_A_PAIR
+            run_jobs(background_backward, jobs, work, upstream, call.remaining, lines)
             v_backgrounds = torch.from_numpy(lines.sum(1)).float()
         return (*(v[:, : opacities.shape[1]] for v in made), v_backgrounds, None)
 
@@ -361,16 +345,6 @@ def _tile_shares(before: np.ndarray) -> np.ndarray:
     tiles, entries = len(before) - 1, int(before[-1])
     # A tile without splats is work, too: its background.
     return weighted_jobs(before + np.arange(tiles + 1), thread_count(tiles, entries))
-
-
-def _what_tiles_read(call: Call, colors: torch.Tensor) -> tuple[Any, ...]:
-    """What both passes over tiles read: rows, colours and their sharing, sizes."""
-    images, gaussians = call.projected.depths.shape
-    shared = _gaussians(colors)
-    repeat = images // max(1, len(shared))  # images in a row that read the same colours
-    options = call.options
-    size = (options.width, options.height, gaussians)
-    return (call.projected.geom.reshape(-1), shared.reshape(-1), repeat, *size)
 
 
 def _list_tiles(projected: Projected, options: Options) -> Lists:
@@ -387,47 +361,20 @@ def _list_tiles(projected: Projected, options: Options) -> Lists:
     np.cumsum(chunk_rows[:, -1], out=image_spans[1:])
     tiles_x = -(-options.width // TILE_WIDTH)
     tiles = tiles_x * -(-options.height // TILE_HEIGHT)
-    spans = lease((int(image_spans[-1]),), np.uint32)
     heads = lease((images, gaussians), np.uint32)
+    spans = lease((int(image_spans[-1]),), np.uint32)
+    walk = Walk(order, visible, chunk_rows, image_spans, heads, spans, tiles_x)
     counts = lease((images, chunks, tiles), np.int32)
     entry_count = lease((images, gaussians), np.int32)
     entry_count[:] = 0
-    run_jobs(
-        count_tiles,
-        images * chunks,
-        work,
-        projected.geom.reshape(-1),
-        order,
-        visible,
-        chunk_rows,
-        image_spans,
-        tiles_x,
-        options.width,
-        spans,
-        heads,
-        counts,
-        entry_count,
-    )
+    geom, jobs = projected.geom.reshape(-1), images * chunks
+    run_jobs(count_tiles, jobs, work, geom, walk, options.width, counts, entry_count)
     start = np.empty(images * tiles + 1, np.int64)
     first_entry = lease((work + 1,), np.int32)
     number = place_tiles(counts, entry_count, start, first_entry)
     _check_room(number)
     entries = lease((number,), np.uint64)
-    run_jobs(
-        fill_tiles,
-        images * chunks,
-        work,
-        order,
-        visible,
-        heads,
-        chunk_rows,
-        image_spans,
-        spans,
-        counts,
-        first_entry,
-        tiles_x,
-        entries,
-    )
+    run_jobs(fill_tiles, jobs, work, walk, counts, first_entry, entries)
     return Lists(start, entries, first_entry, visible)
 
 
@@ -493,21 +440,20 @@ def warm_up(channels: int = UNROLLED[0]) -> None:
 
 @functools.cache
 def _warm_up(channels: int) -> None:
-    kernels = all_kernels()
-    before = sum(kernel.compiled_here() for kernel in kernels)
-    if not all(kernel.on_disk() for kernel in kernels):
+    before = _compiled_here()
+    if not all(on_disk(kernel) for kernel in KERNELS):
         _log.warning(
             "compiling the CPU rasterizer, once on this machine; it takes some ten seconds"
         )
     start = time.perf_counter()
     _draw_nothing(channels)
-    if sum(kernel.compiled_here() for kernel in kernels) > before:
+    if _compiled_here() > before:
         _log.warning("compiled the CPU rasterizer in %.1f s", time.perf_counter() - start)
 
 
-def all_kernels() -> list[Kernel]:
-    """Every kernel that a call runs."""
-    return [value for value in globals().values() if isinstance(value, Kernel)]
+def _compiled_here() -> int:
+    """How many versions of kernels this process had to compile."""
+    return sum(len(kernel.signatures) - sum(kernel.stats.cache_hits.values()) for kernel in KERNELS)
 
 
 def _draw_nothing(channels: int) -> None:

@@ -57,7 +57,7 @@ def rasterize_reference(scene: FlatScene) -> tuple[torch.Tensor, torch.Tensor, d
         "means2d": unflattened(flat["means2d"], scene),
         "depths": unflattened(flat["depths"], scene),
         "radii": unflattened(flat["radii"], scene),
-        "visible": unflattened(torch.tensor([len(index) for index in indices]), scene),
+        "visible": unflattened(flat["radii"].new_tensor([len(i) for i in indices]).long(), scene),
     }
     flat["means2d"] = info["means2d"].reshape(flat["means2d"].shape)
     channels, backgrounds = channels_with_depth(scene.colors, flat["depths"], scene)

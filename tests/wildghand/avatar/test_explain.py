@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from tiny_fits import TINY
+from tiny_fits import UNJUDGED
 
 import wildghand
 from hwp_bench.base.errors import UsageError
@@ -25,7 +25,7 @@ from wildghand.cli.main import main
 @pytest.fixture(scope="module")
 def fitted(make_painted: Callable[..., Capture]) -> tuple[WildGHandAvatar, Capture]:
     capture = make_painted()
-    avatar = wildghand.fit(capture.root, settings=TINY, steps=2, all_frames=True)
+    avatar = wildghand.fit(capture.root, settings=UNJUDGED, steps=2, all_frames=True)
     with torch.no_grad():
         for module in avatar.model.biases:
             module.psi.weight.zero_()
@@ -76,7 +76,7 @@ def test_what_cannot_be_explained_is_refused(fitted) -> None:
         explain_frames(avatar, capture, [len(capture) - 1])
     bare = wildghand.fit(
         capture.root,
-        settings={**TINY, "dpd.enabled": False},
+        settings={**UNJUDGED, "dpd.enabled": False},
         steps=1,
         all_frames=True,
     )

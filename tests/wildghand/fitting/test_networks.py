@@ -16,12 +16,8 @@ from tiny_networks import write_sam_file, write_sam_folder, write_vgg19
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.capture import Capture
 from hwp_bench.cli.main import main as hwp_bench
-from hwp_bench.evaluation.evaluate import (
-    EvaluationSettings,
-    make_plan,
-    open_captures,
-    with_setting_files,
-)
+from hwp_bench.commitments.publication import open_captures
+from hwp_bench.evaluation.evaluate import EvaluationSettings, make_plan, with_setting_files
 from hwp_bench.methods import find_method, read_manifest
 from hwp_bench.methods.contract import RunSettings, TrainingCapture
 from wildghand.avatar.files import load_avatar
@@ -99,7 +95,7 @@ def test_the_binary_mask_is_the_hand_that_was_chosen(
     found = weights(training, **binary, **{"pao.hand": hand})
     settings = read_settings({**FIT, **binary})
     fit = make_fit(training, settings, 0, torch.device("cpu"))
-    masks = hand_masks(training, fit.data.frames, hand, torch.device("cpu"))
+    masks = hand_masks(fit.data, hand, torch.device("cpu"))
     assert torch.equal(found, (masks[:3] > 127).float())
     assert not torch.equal(masks, fit.data.frames.masks)
     if source == "graph-cut":  # the painted hand is where its parameters say, and alone
@@ -184,7 +180,6 @@ def test_an_ablation_takes_the_networks_too(
     folder: Path, make_painted: Callable[..., Capture], tmp_path: Path, capsys: Any
 ) -> None:
     settings = {**FIT, "mode": "paper", "pao.hand": f"sam:{folder / 'sam.pth'}"}
-    settings["pao.regions"] = f"sam:{folder / 'sam.pth'}"
     command = ["ablate", "--binary-mask", "--seeds", "1", "-o", str(tmp_path / "runs")]
     command += ["--capture", str(make_painted().root), *options(settings)]
     assert hwp_bench(command) == 0, capsys.readouterr().err

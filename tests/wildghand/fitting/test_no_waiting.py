@@ -26,12 +26,12 @@ from wildghand.fitting.descent import Descent
 from wildghand.fitting.disentangle import Dpd
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.judging import HiddenSkin
-from wildghand.fitting.light import Shadows
+from wildghand.fitting.light import Lighting
 from wildghand.fitting.objective import Regularisers
 from wildghand.fitting.weights import MaskWeights, Pao
-from wildghand.gaussians.fit_loop import WINDOW, Guard, batches, choose_device, ready_device
+from wildghand.gaussians.fit_loop import batches, choose_device, ready_device
 from wildghand.model.settings import read_settings
-from wildghand.plain.loop import Plateau
+from wildghand.plain.loop import WINDOW, Watchers
 
 FAKE = torch.device("meta")
 HAS_GPU = choose_device("auto").type == "cuda"
@@ -153,7 +153,7 @@ def fake_fit(training: TrainingCapture, changes: dict[str, Any]) -> Fit:
     if fit.model.shadows is not None:
         for name in ("_corners", "_directions", "_strengths"):
             setattr(fit.model.shadows, name, moved(getattr(fit.model.shadows, name)))
-        table = part(fit, Shadows)._table
+        table = part(fit, Lighting)._table
         assert table is not None
         table._device = FAKE
     for kind in (HiddenSkin, Pao, MaskWeights):
@@ -198,12 +198,12 @@ def test_a_step_reads_nothing_from_the_device(
     fit = fake_fit(make_training("both" if "two hands" in name else "right"), VARIANTS[name])
     order = batches(len(fit.data.frames), fit.batch, 0)
     fit.step(next(order), 0.0)  # tables of targets are made in the first step
-    guard, plateau = Guard(), Plateau(10 * WINDOW)
+    watchers = Watchers(10 * WINDOW)
     with Waits() as waits, HandedOver() as handed:
         for step in range(3):
             loss = fit.step(next(order), 0.5)
-            assert guard.watch(step, loss, fit.model)
-            assert not plateau.reached(loss)
+            assert watchers.watch(step, loss, fit.model)
+            assert not watchers.stands_still(loss)
             fit.avatar(step)
     assert waits.found == []
     assert handed.found == []

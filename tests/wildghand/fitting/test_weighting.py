@@ -13,6 +13,7 @@ from tiny_fits import TINY
 
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.fitting.components import make_fit
+from wildghand.fitting.data import FitData
 from wildghand.fitting.disentangle import Dpd
 from wildghand.fitting.fit import Batch, Fit
 from wildghand.fitting.judging import Prepass
@@ -20,7 +21,7 @@ from wildghand.fitting.weights import Pao
 from wildghand.gaussians.training import TrainingFrames
 from wildghand.model.settings import read_settings
 from wildghand.pao.pao import PaoSettings
-from wildghand.prepass import PrepassInput, PrepassSettings, judge_frames
+from wildghand.prepass import PrepassInput, judge_frames
 
 CPU = torch.device("cpu")
 ROWS = torch.tensor([0, 3])
@@ -121,7 +122,7 @@ def test_validation_frames_are_known_to_be_clean(
     # Oracle: the pre-pass with the validation frames and without; a clip that tolerates nothing.
     training = make_training()
     believing = fit_of(training, **{"prepass.tolerance": 1e-3})
-    monkeypatch.setattr(PrepassSettings, "validated", False)
+    monkeypatch.setattr(FitData, "judges", None)
     alone = fit_of(training, **{"prepass.tolerance": 1e-3})
     monkeypatch.undo()
     judges = believing.data.judges

@@ -8,10 +8,10 @@ import math
 import pytest
 import torch
 
-from wildghand.gaussians.adam import PIECE, ClippedAdam
+from wildghand.gaussians.adam import ClippedAdam
 
-#: Whole vectors, rests of them, a scalar, a channels-last weight, and several pieces.
-SHAPES = [(3,), (), (16, 5), (1,), (7, 33), (4, 4, 3, 3), (2 * PIECE + 5,), (9, 16)]
+#: Vectors, a scalar, a channels-last weight, and a long one.
+SHAPES = [(3,), (), (16, 5), (1,), (7, 33), (4, 4, 3, 3), (32_773,), (9, 16)]
 STEPS = 6
 
 
@@ -70,23 +70,6 @@ def test_steps_are_those_of_torch(limit: float, size: float) -> None:
     assert largest_difference(ours, theirs) < 1e-6
 
 
-def test_the_number_of_threads_changes_no_bit() -> None:
-    made = []
-    threads = torch.get_num_threads()
-    try:
-        for count in (1, 3):
-            torch.set_num_threads(count)
-            tensors = [torch.zeros(40, 2 * PIECE, requires_grad=True)]
-            optimizer = ClippedAdam([{"params": tensors, "lr": 0.1}], 1.0)
-            for step in range(STEPS):
-                give_gradients(tensors, step)
-                optimizer.take_step(torch.zeros(()))
-            made.append(tensors[0].detach().clone())
-    finally:
-        torch.set_num_threads(threads)
-    assert torch.equal(*made)
-
-
 def test_a_state_that_torch_saved_goes_on() -> None:
     ours, theirs = parameters(), parameters()
     other = torch_adam(theirs)
@@ -139,17 +122,16 @@ def test_a_gradient_that_is_no_number_skips_the_step(bad: float, clipped: bool, 
 
 
 @pytest.mark.parametrize("loss", [math.nan, math.inf])
-def test_on_a_device_a_loss_that_is_no_number_changes_nothing(loss: float) -> None:
-    """The same code on the CPU, where torch's fused step takes the flag too."""
+def test_a_loss_that_is_no_number_changes_nothing(loss: float) -> None:
     tensors = parameters()
     before = [tensor.detach().clone() for tensor in tensors]
     optimizer = ClippedAdam(groups(tensors), 1.0)
     give_gradients(tensors, 0)
-    optimizer._step_on_device(torch.tensor(loss))
+    optimizer.take_step(torch.tensor(loss))
     assert all(torch.equal(a, b) for a, b in zip(tensors, before, strict=True))
     assert float(optimizer.state[tensors[0]]["step"]) == 0.0
     give_gradients(tensors, 0)
-    optimizer._step_on_device(torch.tensor(1.0))
+    optimizer.take_step(torch.tensor(1.0))
     assert largest_difference(tensors, before) > 1e-3
 
 

@@ -58,14 +58,6 @@ def test_gaussians_move_rigidly_with_their_anchors() -> None:
     np.testing.assert_array_equal(after.opacities, before.opacities)
 
 
-def test_offset_along_z_follows_the_normal() -> None:
-    gaussians = random_gaussians(1)
-    gaussians.offsets.copy_(torch.tensor([[0.0, 0.0, 0.002]]))
-    frame = Rotation.from_rotvec([1.0, 0.5, -0.7])
-    placed = gaussians.place(torch.zeros(1, 1, 3).double(), to_quat(frame)[None, None])
-    np.testing.assert_allclose(placed.means[0, 0], 0.002 * frame.as_matrix()[:, 2], atol=1e-15)
-
-
 def test_every_attribute_gets_a_gradient() -> None:
     gaussians = random_gaussians(3)
     for tensor in gaussians.parameters().values():

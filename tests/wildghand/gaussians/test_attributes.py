@@ -28,18 +28,6 @@ def test_taking_apart_and_putting_together_changes_nothing(lead: list[int], coun
     )
 
 
-def test_biases_of_each_frame_are_added_to_attributes_of_all() -> None:
-    raw, biases = random_attributes(4), random_attributes(3, 4, seed=1)
-    added = raw + biases
-    for name, tensor in added.items():
-        torch.testing.assert_close(tensor, getattr(raw, name)[None] + getattr(biases, name))
-
-
-def test_map_reaches_every_attribute() -> None:
-    raw = random_attributes(4)
-    torch.testing.assert_close(raw.map(torch.neg).concatenate(), -raw.concatenate())
-
-
 def test_activation_by_closed_forms() -> None:
     raw = random_attributes(2, 5)
     activation = Activation(max_offset=0.01875, log_scale_bias=-5.0, max_scale=100.0)

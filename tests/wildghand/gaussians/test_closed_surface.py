@@ -91,7 +91,7 @@ def hard_raw() -> torch.Tensor:
 
 
 @FLATNESS
-def test_the_compiled_pass(flatness: float) -> None:
+def test_float32_is_exact_enough(flatness: float) -> None:
     """Oracle: autograd in float64 on the same numbers; 1e-5 of the value, 1e-4 of the gradient."""
     exact, raw = hard_raw().float().double().requires_grad_(), hard_raw().float().requires_grad_()
     activation = Activation(max_offset=0.008)
@@ -109,29 +109,6 @@ def test_the_compiled_pass(flatness: float) -> None:
     off = (raw.grad - exact.grad).abs() / size.clamp(min=float(size.mean()))
     assert float(off.max()) < 1e-4
     assert float((exact.grad != 0.0).double().mean()) > 0.4
-
-
-def test_threads_change_nothing() -> None:
-    raw, before, found = hard_raw().float().repeat(1, 4, 1), torch.get_num_threads(), []
-    try:
-        for threads in (1, 2):
-            torch.set_num_threads(threads)
-            given = raw.clone().requires_grad_()
-            value = off_surface(RawAttributes.split(given), Activation(), SPACING)
-            value.backward()
-            assert given.grad is not None
-            found.append((value.item(), given.grad))
-    finally:
-        torch.set_num_threads(before)
-    assert found[0][0] == found[1][0]
-    assert torch.equal(found[0][1], found[1][1])
-
-
-def test_the_compiled_pass_takes_no_frames() -> None:
-    raw = torch.randn(40, 14, generator=torch.Generator().manual_seed(1))
-    alone = off_surface(RawAttributes.split(raw), Activation(), SPACING)
-    frame = off_surface(RawAttributes.split(raw[None]), Activation(), SPACING)
-    assert torch.equal(alone, frame)
 
 
 def test_nothing_but_the_term_closes_a_hand(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,13 @@ import torch
 from hwp_bench.base.errors import ShapeMismatch
 from hwp_bench.hands import load_template
 from hwp_bench.hands.anchors import anchor_positions
-from wildghand.gaussians.regularizers import SurfaceLaplacian, nearest_on_surface, surface_laplacian
+from wildghand.gaussians.attributes import RawAttributes
+from wildghand.gaussians.regularizers import (
+    SurfaceLaplacian,
+    attribute_roughness,
+    nearest_on_surface,
+    surface_laplacian,
+)
 from wildghand.gaussians.rig import HandRig, make_rig
 
 
@@ -97,3 +103,22 @@ def test_few_anchors_work(count: int) -> None:
     assert values.grad.isfinite().all()
     with pytest.raises(ShapeMismatch, match="values"):
         made(torch.zeros(count + 1, 3))
+
+
+@pytest.mark.parametrize("frames", [1, 3])
+@pytest.mark.parametrize(("scales", "colors"), [(0.3, 2.0), (0.0, 1.0)])
+def test_roughness_of_attributes_is_that_of_its_parts_in_float64(
+    rig: HandRig, laplacian: SurfaceLaplacian, frames: int, scales: float, colors: float
+) -> None:
+    random = torch.Generator().manual_seed(0)
+    raw = torch.randn(frames, 400, 14, generator=random).requires_grad_()
+    value = attribute_roughness(surface_laplacian(rig), RawAttributes.split(raw), scales, colors)
+    (gradient,) = torch.autograd.grad(3.0 * value, raw)
+    true = raw.detach().double()
+    parts = RawAttributes.split(true.requires_grad_())
+    oracle = scales * laplacian.roughness(parts.log_scales)
+    oracle = oracle + colors * laplacian.roughness(parts.logit_colors.sigmoid())
+    (expected,) = torch.autograd.grad(3.0 * oracle, true)
+    torch.testing.assert_close(value.double(), oracle, rtol=1e-5, atol=0)
+    scale = float(expected.abs().max())
+    torch.testing.assert_close(gradient.double() / scale, expected / scale, rtol=0, atol=1e-5)

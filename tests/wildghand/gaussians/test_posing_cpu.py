@@ -113,13 +113,6 @@ def test_any_angle_turns_as_in_float64(
     torch.testing.assert_close(mine.grad.double() / scale, true.grad / scale, rtol=0, atol=1e-5)
 
 
-def test_no_gradient_where_nobody_asks() -> None:
-    hand = rig(correctives=False)
-    with torch.no_grad():
-        posed = hand.follow(*given_parameters(1, shapes=False))
-    assert posed.positions.grad_fn is None
-
-
 def test_threads_do_not_change_a_bit() -> None:
     hand = make_rig(load_template(), 9_000)
     before, found = torch.get_num_threads(), []

@@ -58,10 +58,3 @@ def test_half_turns_where_the_trace_formula_fails() -> None:
     assert torch.isfinite(quats).all()
     # Near a half turn the entries of a matrix say the axis to about the root of the precision.
     np.testing.assert_allclose((quats * to_quat(rotations)).sum(-1).abs(), 1.0, atol=1e-7)
-
-
-def test_shapes_broadcast() -> None:
-    quats = to_quat(Rotation.random(6, random_state=0)).reshape(2, 3, 4)
-    vectors = torch.ones(3, 3, dtype=torch.float64)
-    assert quat_rotate(quats, vectors).shape == (2, 3, 3)
-    assert quat_multiply(quats, quats[0]).shape == (2, 3, 4)

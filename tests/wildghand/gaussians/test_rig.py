@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from hwp_bench.base.errors import UsageError
-from hwp_bench.hands import HandTemplate, anchor_normals, anchor_positions, load_template, pose_hand
-from wildghand.gaussians.quaternions import quat_third_axis
+from hwp_bench.hands import HandTemplate, load_template
 from wildghand.gaussians.rig import CHUNK, make_rig
 
 
@@ -25,22 +23,6 @@ def parameters(frames: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, 
         0.3 * torch.randn(frames, 16, 3, generator=random),
         torch.randn(10, generator=random),
         torch.randn(frames, 3, generator=random),
-    )
-
-
-def test_anchors_are_on_the_posed_surface_with_its_normals(template: HandTemplate) -> None:
-    rig = make_rig(template, 200, seed=1)
-    pose, betas, transl = parameters(3)
-    posed = rig.pose(pose, betas, transl)
-    tensors = template.to_torch(torch.float64)
-    vertices = pose_hand(tensors, *(t.double() for t in (pose, betas, transl))).vertices
-    np.testing.assert_allclose(
-        posed.positions, anchor_positions(vertices, tensors.faces, rig.anchors), atol=1e-6
-    )
-    np.testing.assert_allclose(
-        quat_third_axis(posed.orientations),
-        anchor_normals(vertices, tensors.faces, rig.anchors),
-        atol=1e-5,
     )
 
 
@@ -71,8 +53,3 @@ def test_spacing_is_that_of_a_square_grid_of_equal_area(template: HandTemplate) 
     area = 0.5 * np.linalg.norm(cross, axis=1).sum()
     rig = make_rig(template, 400)
     assert rig.spacing**2 * len(rig) == pytest.approx(area, rel=1e-5)
-
-
-def test_no_anchors_is_an_error(template: HandTemplate) -> None:
-    with pytest.raises(UsageError, match="count"):
-        make_rig(template, 0)

@@ -41,11 +41,6 @@ def test_each_degree_spans_what_scipy_spans(degree: int) -> None:
     np.testing.assert_allclose(fitted, expected, atol=1e-12)
 
 
-def test_linear_part_is_the_normal() -> None:
-    normals = torch.from_numpy(sphere(50))
-    np.testing.assert_allclose(sh_basis(normals, 1)[:, 1:], math.sqrt(3.0) * normals, atol=1e-15)
-
-
 @pytest.mark.parametrize("degree", [-1, 4, 1.5])
 def test_degrees_that_do_not_exist(degree: int) -> None:
     with pytest.raises(UsageError, match="degree"):

@@ -1,4 +1,4 @@
-"""Heads of `compact` with a gradient by hand; oracle: the modules one by one, in float64; 1e-5."""
+"""Values and gradients of `compact` in float32; oracle: the same in float64; 1e-5."""
 
 from __future__ import annotations
 
@@ -14,13 +14,6 @@ from wildghand.network import (
     SurfacePoints,
     network_settings,
 )
-from wildghand.network import (
-    frame_heads as compact_frames,
-)
-from wildghand.network import (
-    frame_heads as frame_heads_cpu,
-)
-from wildghand.network import network as network_module
 
 COUNT = 700
 COLOR = torch.tensor([0.6, 0.45, 0.4])
@@ -83,30 +76,14 @@ def gradients(network: PredictionNetwork, normals: Tensor, pose: Tensor) -> dict
     return {name: gradient.clone() for name, gradient in found.items() if gradient is not None}
 
 
-@pytest.mark.parametrize("compiled", [True, False])
 @pytest.mark.parametrize(("direct", "degree", "batch"), [(True, 3, 1), (True, 2, 3), (False, 1, 2)])
-def test_values_and_gradients_are_those_of_the_modules(
-    direct: bool, degree: int, batch: int, compiled: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if compiled:
-        monkeypatch.delattr(compact_frames, "_FrameHeads")
-    else:
-        monkeypatch.setattr(compact_frames, "kernels_take", lambda *tensors: False)
-        monkeypatch.delattr(frame_heads_cpu, "FrameHeadsCpu")
+def test_float32_is_as_float64(direct: bool, degree: int, batch: int) -> None:
     network = made(direct, degree)
     normals, pose = inputs(batch)
     exact = copy.deepcopy(network).double()
-    called = []
-    fused = network_module.frame_heads
-    monkeypatch.setattr(
-        network_module, "frame_heads", lambda *a, **k: called.append(1) or fused(*a, **k)
-    )
     values, slopes = parts(network("right", normals, pose)), gradients(network, normals, pose)
-    assert called
-    called.clear()
     true_values = parts(exact("right", normals.double(), pose.double()))
     true_slopes = gradients(exact, normals.double(), pose.double())
-    assert not called
     for value, true in zip(values, true_values, strict=True):
         torch.testing.assert_close(value.double(), true, rtol=1e-5, atol=1e-5)
     for name, true in true_slopes.items():
@@ -124,41 +101,3 @@ def test_the_number_of_threads_changes_rounding_only_and_a_call_repeats_exactly(
     finally:
         torch.set_num_threads(before)
     assert all(torch.equal(first[name], again[name]) for name in first)
-
-
-def test_widths_that_fill_no_vector(monkeypatch: pytest.MonkeyPatch) -> None:
-    network = made(True, 3, point_width=20, head_width=24)
-    normals, pose = inputs(2)
-    values, slopes = parts(network("right", normals, pose)), gradients(network, normals, pose)
-    monkeypatch.setattr(compact_frames, "kernels_take", lambda *tensors: False)
-    expected = parts(network("right", normals, pose)), gradients(network, normals, pose)
-    for value, oracle in zip(values, expected[0], strict=True):
-        torch.testing.assert_close(value, oracle, rtol=1e-5, atol=1e-5)
-    for name, oracle in expected[1].items():
-        scale = float(oracle.abs().max())
-        torch.testing.assert_close(slopes[name] / scale, oracle / scale, rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-def test_threads_change_no_bit_of_the_heads(threads: int) -> None:
-    before, network = torch.get_num_threads(), made(True, 3)
-    normals, pose = inputs(2)
-    features = network.features("right")
-    found = []
-    try:
-        for number in (1, threads):
-            torch.set_num_threads(number)
-            output = network("right", normals, pose, features)
-            total = output.raw.concatenate().square().sum() + output.shadow.square().sum()
-            weights = [*network.geometry_branch.parameters(), *network.shadow_head.parameters()]
-            slopes = torch.autograd.grad(total, weights, retain_graph=True)
-            found.append([output.raw.concatenate(), output.shadow, *slopes])
-    finally:
-        torch.set_num_threads(before)
-    assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
-
-
-def test_deeper_heads_take_the_modules(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delattr(network_module, "frame_heads")
-    output = made(True, 3, layers=2)("right", *inputs(1))
-    assert output.raw.concatenate().isfinite().all()

@@ -224,11 +224,6 @@ def test_in_half_precision_it_predicts_nearly_the_same_in_float32(size: str) -> 
     assert all(p.grad is None or p.grad.isfinite().all() for p in net.parameters())
 
 
-def test_one_hand_has_one_half_of_the_map() -> None:
-    net = PredictionNetwork(small("compact"), {"left": surfaces(20)["left"]})
-    assert list(net.identity.maps) == ["left"]
-
-
 @pytest.mark.parametrize("size", ["compact", "paper"])
 def test_groups_hold_every_parameter_once(size: str) -> None:
     net = network(size)
@@ -258,8 +253,8 @@ def test_wrong_calls_are_refused_by_name() -> None:
 
 @pytest.mark.slow
 def test_paper_at_its_real_size_predicts_every_gaussian() -> None:
-    """All the paper's dimensions, forward only; a sixth of its 49,281 Gaussians."""
-    count = 8_192
+    """All the paper's dimensions, forward only; 1,024 of its 49,281 Gaussians."""
+    count = 1_024
     net = PredictionNetwork(network_settings("paper"), {"right": surfaces(count)["right"]})
     with torch.no_grad():
         prediction = net("right", *frames(count, 1))

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hwp_bench.base.errors import UsageError
-from wildghand.network.surface import CellPooling, PlaneSampler, bilinear_taps
+from wildghand.network.surface import CellPooling, PlaneSampler
 
 
 def points(count: int, seed: int = 0) -> torch.Tensor:
@@ -54,11 +54,6 @@ def test_corners_of_the_atlas_read_its_corner_texels() -> None:
     uv = torch.tensor([[0.0, 0.0], [1.0, 1.0]])
     read = PlaneSampler(uv, 2)(torch.tensor([[1.0], [2.0], [3.0], [4.0]]))
     torch.testing.assert_close(read, torch.tensor([[3.0], [2.0]]))
-
-
-def test_weights_sum_to_one() -> None:
-    _, weight = bilinear_taps(points(100), 16)
-    torch.testing.assert_close(weight.sum(dim=1), torch.ones(100, dtype=torch.float64))
 
 
 def test_cells_hold_the_means_of_their_points() -> None:

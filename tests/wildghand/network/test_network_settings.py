@@ -12,14 +12,6 @@ from hwp_bench.methods.settings import settings_from
 from wildghand.network import NetworkSettings, network_settings
 
 
-def test_paper_has_the_papers_dimensions() -> None:
-    paper = network_settings("paper")
-    assert (paper.identity_resolution, paper.identity_channels) == (64, 33)
-    assert (paper.plane_resolution, paper.plane_width, paper.point_width) == (32, 512, 128)
-    assert (paper.transformer_layers, paper.attention_heads) == (10, 8)
-    assert (paper.head_width, paper.head_layers) == (256, 2)
-
-
 @pytest.mark.parametrize("size", ["compact", "paper"])
 def test_settings_survive_json(size: str) -> None:
     chosen = network_settings(size)
@@ -55,8 +47,3 @@ def test_settings_that_do_not_fit_together_are_refused(
 ) -> None:
     with pytest.raises(BadMethod, match=field):
         network_settings(size, **changes)
-
-
-def test_a_methods_table_with_a_bad_network_is_refused() -> None:
-    with pytest.raises(BadMethod, match="head_width"):
-        settings_from(NetworkSettings, {"head_width": 0}, "wildghand")

@@ -8,27 +8,15 @@ from __future__ import annotations
 import logging
 import platform
 import re
+from typing import Any
 
 import numba
 import numpy as np
 import pytest
 
-from wildghand.splat import numba_backend as stages
-from wildghand.splat import numba_backend as warmup
-from wildghand.splat.kernels import (
-    groups as rows,
-)
-from wildghand.splat.kernels import (
-    jit,
-    project,
-    tiles,
-)
-from wildghand.splat.kernels import (
-    tiles as alpha,
-)
-from wildghand.splat.kernels import (
-    vectors as lanes,
-)
+from hwp_bench.base.kernels import on_disk
+from wildghand.splat import numba_backend
+from wildghand.splat.kernels import jit, project, tiles, vectors
 from wildghand.splat.kernels.blend import blend, blend_backward
 from wildghand.splat.kernels.project import project as project_kernel
 from wildghand.splat.kernels.project import project_backward
@@ -36,12 +24,17 @@ from wildghand.splat.kernels.project import project_backward
 X86 = platform.machine().lower() in ("x86_64", "amd64")
 
 
-def machine_code(kernel: jit.Kernel) -> str:
-    """Assembly of the kernel's first version: unrolled, as RGB uses it."""
-    warmup.warm_up()
-    fresh = numba.njit(nogil=True, boundscheck=False, error_model="numpy")(kernel.__wrapped__)
-    signature = kernel.dispatcher.signatures[0]
-    fresh.compile(signature)
+def recompiled(kernel: Any) -> tuple[Any, Any]:
+    """A kernel's first version, unrolled as RGB uses it, compiled anew; and its signature."""
+    numba_backend.warm_up()
+    fresh = numba.njit(nogil=True, boundscheck=False, error_model="numpy")(kernel.py_func)
+    fresh.compile(kernel.signatures[0])
+    return fresh, kernel.signatures[0]
+
+
+def machine_code(kernel: Any) -> str:
+    """Its assembly."""
+    fresh, signature = recompiled(kernel)
     return fresh.inspect_asm(signature)
 
 
@@ -55,7 +48,7 @@ def innermost_block(assembly: str, marker: str) -> str:
 
 @pytest.mark.skipif(not X86, reason="reads x86 assembly")
 @pytest.mark.parametrize(("kernel", "products"), [(blend, 10), (blend_backward, 18)])
-def test_the_inner_loop_over_pixels_is_vectorised(kernel: jit.Kernel, products: int) -> None:
+def test_the_inner_loop_over_pixels_is_vectorised(kernel: Any, products: int) -> None:
     """2^n is made by shifting integers by 23 bits: that marks the loop."""
     loop = innermost_block(machine_code(kernel), r"v?pslld\s+\$23")
     packed = re.findall(r"\bv?f?n?m(?:add|sub|ul)\w*ps\b|\bvfn?m(?:add|sub)\w*ps\b", loop)
@@ -68,7 +61,7 @@ def test_the_inner_loop_over_pixels_is_vectorised(kernel: jit.Kernel, products: 
 
 @pytest.mark.skipif(not X86, reason="reads x86 assembly")
 @pytest.mark.parametrize("kernel", [project_kernel, project_backward])
-def test_the_projection_is_vectorised(kernel: jit.Kernel) -> None:
+def test_the_projection_is_vectorised(kernel: Any) -> None:
     assembly = machine_code(kernel)
     packed = re.findall(r"\bv?(?:mul|fn?m(?:add|sub)\w+)pd\b", assembly)
     scalar = re.findall(r"\bv?(?:mul|fn?m(?:add|sub)\w+)sd\b", assembly)
@@ -78,44 +71,39 @@ def test_the_projection_is_vectorised(kernel: jit.Kernel) -> None:
 
 def test_no_fast_math_in_the_intermediate_code() -> None:
     """`nnan`, `ninf` and `fast` would let the compiler drop the tests that cull."""
-    warmup.warm_up()
-    fresh = numba.njit(nogil=True, boundscheck=False, error_model="numpy")(
-        project_kernel.__wrapped__
-    )
-    signature = project_kernel.dispatcher.signatures[0]
-    fresh.compile(signature)
+    fresh, signature = recompiled(project_kernel)
     assert not re.search(r"\b(fast|nnan|ninf)\b", fresh.inspect_llvm(signature))
 
 
 @numba.njit
 def _exp2(values, out):
     for k in range(0, values.size, tiles.LANES):
-        lanes.store(out, k, alpha.exp2(tiles.load_pixels(values, k)))
+        vectors.store(out, k, tiles.exp2(tiles.load_pixels(values, k)))
 
 
 @numba.njit
 def _log2(values, out):
-    (x,) = rows.load1(values, 0)
-    rows.store_column(out, 0, project.log2(x))
+    (x,) = project.load1(values, 0)
+    project.store_columns(out, 0, (project.log2(x),))
 
 
 @numba.njit
 def _sums(values, out):
     a = tiles.load_pixels(values, 0)
-    lanes.store_sums(out, 0, (a, a * a, a + a))
+    vectors.store_sums(out, 0, (a, a * a, a + a))
 
 
 @numba.njit
 def _columns(values, out, total):
-    x, y, z = rows.load3(values, 0)
-    rows.add_columns(out, 0, (x, y * 10.0, z * 1e300))
-    total[0] = rows.total(x)
+    x, y, z = project.load3(values, 0)
+    project.add_columns(out, 0, (x, y * 10.0, z * 1e300))
+    total[0] = project.total(x)
 
 
 @numba.njit
 def _rows(values, out):
-    (v,) = rows.load1(values, 0)
-    rows.store_rows(
+    (v,) = project.load1(values, 0)
+    project.store_rows(
         out, 0,
         (v, v + 10.0, v + 20.0, v + 30.0, v + 40.0, v + 50.0, v + 60.0, v + 70.0,
          v + 80.0, v + 90.0, v + 100.0, v + 110.0, v + 120.0, v + 130.0, v + 140.0, v + 150.0),
@@ -161,7 +149,7 @@ def test_tiles_are_made_of_blocks_that_fill_a_vector() -> None:
     assert tiles.BLOCK_WIDTH * tiles.BLOCK_HEIGHT == tiles.LANES
     assert tiles.TILE_WIDTH * tiles.TILE_HEIGHT == tiles.BLOCKS * tiles.LANES
     places = {
-        alpha.place_of.py_func(x, y)
+        tiles.place_of.py_func(x, y)
         for y in range(tiles.TILE_HEIGHT)
         for x in range(tiles.TILE_WIDTH)
     }
@@ -169,13 +157,13 @@ def test_tiles_are_made_of_blocks_that_fill_a_vector() -> None:
 
 
 def test_sort_is_by_depth_and_stable() -> None:
-    warmup.warm_up()
+    numba_backend.warm_up()
     generator = np.random.default_rng(0)
     depths = generator.choice([0.0, 0.5, 1.0, 1.5, 1e-38, 3e38], size=(3, 1000)).astype(np.float32)
     visible = np.array([(row > 0).sum() for row in depths])
     order = np.empty((3, 1000), np.int32)
     found, chunk_rows = np.empty(3, np.int64), np.empty((3, 3), np.int64)
-    stages.sort_by_depth(
+    numba_backend.sort_by_depth(
         0, np.zeros(8, np.int64), np.array([0, 3]), depths, np.ones((3, 1000), np.int32), order,
         np.empty((3, 1000), np.int32), found, chunk_rows,
     )  # fmt: skip
@@ -190,27 +178,29 @@ def test_the_first_call_says_that_it_compiles(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     drawn: list[int] = []
-    monkeypatch.setattr(jit.Kernel, "on_disk", lambda self: False)
-    monkeypatch.setattr(jit.Kernel, "compiled_here", lambda self: len(drawn))
-    monkeypatch.setattr(warmup, "_draw_nothing", drawn.append)
-    warmup._warm_up.cache_clear()
+    monkeypatch.setattr(numba_backend, "on_disk", lambda kernel: False)
+    monkeypatch.setattr(numba_backend, "_compiled_here", lambda: len(drawn))
+    monkeypatch.setattr(numba_backend, "_draw_nothing", drawn.append)
+    numba_backend._warm_up.cache_clear()
     with caplog.at_level(logging.WARNING):
-        warmup.warm_up()
-        warmup.warm_up()
+        numba_backend.warm_up()
+        numba_backend.warm_up()
     assert re.match(r"compiling the CPU rasterizer, once", caplog.messages[0])
     assert re.match(r"compiled the CPU rasterizer in \d+\.\d s", caplog.messages[1])
     assert len(caplog.messages) == 2
     # Any number of channels that is not unrolled is one more version, made when it is asked for.
-    warmup.warm_up(4)
-    warmup.warm_up(17)
+    numba_backend.warm_up(4)
+    numba_backend.warm_up(17)
     assert drawn == [3, 4]
-    warmup._warm_up.cache_clear()
+    numba_backend._warm_up.cache_clear()
 
 
-def test_all_kernels_are_made_ready_and_say_what_was_compiled() -> None:
-    warmup.warm_up()
-    assert len(warmup.all_kernels()) == 11
-    assert all(kernel.dispatcher.signatures for kernel in warmup.all_kernels())
+def test_all_kernels_are_made_ready() -> None:
+    numba_backend.warm_up()
+    assert all(kernel.signatures for kernel in numba_backend.KERNELS)
+    names = {kernel.py_func.__name__ for kernel in numba_backend.KERNELS}
+    called = {name for name, value in vars(numba_backend).items() if hasattr(value, "py_func")}
+    assert names == called
 
 
 def test_a_kernel_of_another_package_is_not_kept_on_disk() -> None:
@@ -219,5 +209,4 @@ def test_a_kernel_of_another_package_is_not_kept_on_disk() -> None:
         return 2 * x
 
     assert double(21) == 42
-    assert double.compiled_here() == 1
-    assert not double.on_disk()
+    assert not on_disk(double)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from painted import SilentReport
-from tiny_fits import TINY
+from tiny_fits import UNJUDGED
 
 from hwp_bench.capture import Capture
 from hwp_bench.methods.contract import Budget, TrainingCapture
@@ -24,7 +24,7 @@ from wildghand.model.settings import read_settings
 from wildghand.plain.loop import Watchers, run_fit
 from wildghand.viewer.live import Live
 
-QUICK: dict[str, Any] = {**TINY, "gaussians": 400}
+QUICK: dict[str, Any] = {**UNJUDGED, "gaussians": 400}
 TrainingMaker = Callable[..., TrainingCapture]
 
 

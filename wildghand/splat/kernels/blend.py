@@ -15,9 +15,15 @@ from typing import NamedTuple
 import numpy as np
 
 from wildghand.splat.kernels import tiles as at
-from wildghand.splat.kernels.groups import GROUP, fill_exact, load1
-from wildghand.splat.kernels.jit import inline, kernel, next_job
-from wildghand.splat.kernels.project import PIECE, clear_first, entry_of
+from wildghand.splat.kernels.jit import inline, jobs, kernel
+from wildghand.splat.kernels.project import (
+    GROUP,
+    PIECE,
+    clear_first,
+    entry_of,
+    fill_exact,
+    load1,
+)
 from wildghand.splat.kernels.tiles import (
     BATCH,
     BLOCKS,
@@ -59,8 +65,37 @@ from wildghand.splat.kernels.vectors import (
     store,
 )
 
-#: The entries of a tile that are being worked on: what `enter_batch` writes.
-BATCH_FLOATS = 2 * BLOCKS * BATCH
+
+class TileScene(NamedTuple):
+    """What both passes read: splats, and which of them each tile blends."""
+
+    start: np.ndarray  # (tiles + 1,) int64, where the list of each tile starts
+    entries: np.ndarray  # (E,) uint64, see `lists.fill_tiles`
+    geom: np.ndarray  # flat float32 (I, N, 16)
+    colors: np.ndarray  # flat float32 (S, N, D)
+    color_repeat: int  # images in a row that read the same colours
+    width: int
+    height: int
+    gaussians: int
+
+
+class Workspace(NamedTuple):
+    """Memory of one thread."""
+
+    state: np.ndarray  # vectors of each block of a tile, transmittance first
+    offsets: np.ndarray  # of the entries at hand, what `enter_batch` writes
+    blocks: np.ndarray
+    ids: np.ndarray
+    slopes: np.ndarray
+
+
+@inline
+def make_workspace(stride):
+    """Room for blocks of `stride` floats."""
+    return Workspace(
+        scratch(BLOCKS * stride), scratch(2 * BLOCKS * BATCH), np.empty(BATCH, np.uint64),
+        np.empty(BATCH, np.int64), np.empty(BATCH, np.float32),
+    )  # fmt: skip
 
 
 @inline
@@ -94,15 +129,16 @@ def corner_of(tile, width, height):
 
 
 @inline
-def blend_tile(
-    geom, base, colors, color_base, entries, first, last, tile_x, tile_y,
-    state, offsets, blocks, ids, slopes, channels, counting,
-):  # fmt: skip
+def blend_tile(scene, corner, first, last, work, channels, counting):
     """Blends the entries from `first` to `last` into the tile's state.
 
     Returns:
         Where the list could stop, because every pixel was saturated; the blended pairs.
     """
+    image, left, top = corner
+    geom, colors, state = scene.geom, scene.colors, work.state
+    base = image * scene.gaussians
+    color_base = image // scene.color_repeat * scene.gaussians
     stride = (1 + count(channels)) * LANES
     pairs = 0
     for start in range(first, last, BATCH):
@@ -110,22 +146,20 @@ def blend_tile(
         if alive == 0:
             return start, pairs
         stop = min(start + BATCH, last)
-        enter_batch(
-            geom, base, entries, start, stop, last, tile_x, tile_y, alive,
-            offsets, blocks, ids, slopes,
-        )  # fmt: skip
+        enter_batch(geom, base, scene.entries, start, stop, last, left, top, alive, work)
         for i in range(stop - start):
-            row = (base + ids[i]) * at.ROW
-            u_pixel, e_pixel = relative_pixels(geom, row, slopes[i])
+            n = work.ids[i]
+            row = (base + n) * at.ROW
+            u_pixel, e_pixel = relative_pixels(geom, row, work.slopes[i])
             opacity = geom[row + at.LOG2_OPACITY]
-            color = fetch(colors, (color_base + ids[i]) * count(channels), channels)
-            inside = blocks[i]
+            color = fetch(colors, (color_base + n) * count(channels), channels)
+            inside = work.blocks[i]
             while inside != 0:
                 b = lowest_bit(inside)
                 inside &= inside - np.uint64(1)
                 place = b * stride
                 _, _, _, _, _, weight, blended = meet(
-                    u_pixel, e_pixel, offsets, 2 * BLOCKS * i, b, opacity, state, place
+                    u_pixel, e_pixel, work.offsets, 2 * BLOCKS * i, b, opacity, state, place
                 )
                 paint(state, place + LANES, weight, colors, color, channels)
                 if counting:
@@ -136,14 +170,12 @@ def blend_tile(
 @kernel
 def blend(
     worker, counters, ends,
-    start, entries, geom, colors, color_repeat, width, height, gaussians,
-    backgrounds, images, alphas, remaining, stops, pairs, channels, counting,
+    scene, backgrounds, images, alphas, remaining, stops, pairs, channels, counting,
 ):  # fmt: skip
     """Draws every image.
 
     Args:
-        geom: flat float32 (I, N, 16).
-        colors: flat float32 (S, N, D).
+        scene: `TileScene`.
         backgrounds: float32 (I, D).
         images: out, flat float32 (I, H, W, D).
         alphas: out, flat float32 (I, H, W).
@@ -151,17 +183,15 @@ def blend(
         stops: out, int64 (tiles,); end of the part of each list that was looked at.
         pairs: out, int64 (tiles,); blended (splat, pixel) pairs, if `counting`.
     """
+    width, height = scene.width, scene.height
     size = count(channels)
     stride = (1 + size) * LANES
-    state, offsets = scratch(BLOCKS * stride), scratch(BATCH_FLOATS)
-    blocks, ids = np.empty(BATCH, np.uint64), np.empty(BATCH, np.int64)
-    slopes = np.empty(BATCH, np.float32)
-    while True:
-        tile = next_job(worker, counters, ends)
-        if tile < 0:
-            break
-        image, left, top = corner_of(tile, width, height)
-        first, last = start[tile], start[tile + 1]
+    work = make_workspace(stride)
+    state = work.state
+    for tile in jobs(worker, counters, ends):
+        corner = corner_of(tile, width, height)
+        image, left, top = corner
+        first, last = scene.start[tile], scene.start[tile + 1]
         stops[tile] = first
         pairs[tile] = 0
         if first < last:
@@ -175,10 +205,8 @@ def blend(
                         b, lane = place_of(x, y)
                         state[b * stride + lane] = -ONE
             stops[tile], pairs[tile] = blend_tile(
-                geom, image * gaussians, colors, image // color_repeat * gaussians, entries,
-                first, last, left + 0.5, top + 0.5,
-                state, offsets, blocks, ids, slopes, channels, counting,
-            )  # fmt: skip
+                scene, corner, first, last, work, channels, counting
+            )
         for y in range(min(TILE_HEIGHT, height - top)):
             line = (image * height + top + y) * width + left
             for x in range(min(TILE_WIDTH, width - left)):
@@ -199,10 +227,7 @@ def blend(
 
 
 @inline
-def tile_backward(
-    geom, base, colors, color_base, entries, first, last, tile_x, tile_y,
-    state, offsets, blocks, ids, slopes, sum_scratch, slots, slot, slot_size, channels,
-):  # fmt: skip
+def tile_backward(scene, corner, first, last, work, sum_scratch, slots, slot, slot_size, channels):
     """Gradients of the entries from `first` to `last`, written to consecutive slots.
 
     Front to back again, with one number for all that lies behind. For a pixel with upstream
@@ -214,28 +239,31 @@ def tile_backward(
     loses a T (c . v) at every splat. So nothing but the image and its transmittance need be kept
     from the forward pass.
     """
+    image, left, top = corner
+    geom, colors, state = scene.geom, scene.colors, work.state
+    base = image * scene.gaussians
+    color_base = image // scene.color_repeat * scene.gaussians
     stride = (2 + count(channels)) * LANES
     zero = fill_pixels(ZERO)
     for start in range(first, last, BATCH):
         stop = min(start + BATCH, last)
-        enter_batch(
-            geom, base, entries, start, stop, last, tile_x, tile_y, alive_blocks(state, stride),
-            offsets, blocks, ids, slopes,
-        )  # fmt: skip
+        alive = alive_blocks(state, stride)
+        enter_batch(geom, base, scene.entries, start, stop, last, left, top, alive, work)
         for i in range(stop - start):
-            row = (base + ids[i]) * at.ROW
-            u_pixel, e_pixel = relative_pixels(geom, row, slopes[i])
+            n = work.ids[i]
+            row = (base + n) * at.ROW
+            u_pixel, e_pixel = relative_pixels(geom, row, work.slopes[i])
             opacity = geom[row + at.LOG2_OPACITY]
-            color = fetch(colors, (color_base + ids[i]) * count(channels), channels)
+            color = fetch(colors, (color_base + n) * count(channels), channels)
             sums = start_sums(sum_scratch, channels)
             m, m_u, m_e, m_uu, m_ue, m_ee = zero, zero, zero, zero, zero, zero
-            inside = blocks[i]
+            inside = work.blocks[i]
             while inside != 0:
                 b = lowest_bit(inside)
                 inside &= inside - np.uint64(1)
                 place = b * stride
                 u, e, power, before, alpha, weight, blended = meet(
-                    u_pixel, e_pixel, offsets, 2 * BLOCKS * i, b, opacity, state, place
+                    u_pixel, e_pixel, work.offsets, 2 * BLOCKS * i, b, opacity, state, place
                 )
                 gain = project(state, place + 2 * LANES, colors, color, channels)
                 behind = fma(negate(weight), gain, load_pixels(state, place + LANES))
@@ -244,14 +272,9 @@ def tile_backward(
                 free = blended & (power <= LOG2_MAX_ALPHA)
                 v_power = select(free, alpha * v_alpha, ZERO)
                 sums = add_to_sums(sums, weight, state, place + 2 * LANES)
-                v_u = v_power * u
-                v_e = v_power * e
-                m = m + v_power
-                m_u = m_u + v_u
-                m_e = m_e + v_e
-                m_uu = fma(v_u, u, m_uu)
-                m_ue = fma(v_u, e, m_ue)
-                m_ee = fma(v_e, e, m_ee)
+                v_u, v_e = v_power * u, v_power * e
+                m, m_u, m_e = m + v_power, m_u + v_u, m_e + v_e
+                m_uu, m_ue, m_ee = fma(v_u, u, m_uu), fma(v_u, e, m_ue), fma(v_e, e, m_ee)
             finish_sums(slots, slot * slot_size, (m, m_u, m_e, m_uu, m_ue, m_ee), sums)
             slot += 1
 
@@ -259,8 +282,8 @@ def tile_backward(
 @kernel
 def blend_backward(
     worker, counters, ends,
-    start, stops, first_slot, entries, geom, colors, color_repeat, width, height, gaussians,
-    images, remaining, v_images, v_alphas, slots, slot_size, slot_of, channels,
+    scene, stops, first_slot, images, remaining, v_images, v_alphas, slots, slot_size, slot_of,
+    channels,
 ):  # fmt: skip
     """Gradients of every (splat, tile) pair that was looked at.
 
@@ -269,16 +292,12 @@ def blend_backward(
         slots: out, flat float32, `slot_size` for each pair; see `tiles.finish_sums`.
         slot_of: out, int32 (E,); slot of each entry in order of Gaussians, or -1.
     """
+    width, height, start, entries = scene.width, scene.height, scene.start, scene.entries
     size = count(channels)
     stride = (2 + size) * LANES
-    state, offsets = scratch(BLOCKS * stride), scratch(BATCH_FLOATS)
-    sum_scratch = scratch(size * LANES)
-    blocks, ids = np.empty(BATCH, np.uint64), np.empty(BATCH, np.int64)
-    slopes = np.empty(BATCH, np.float32)
-    while True:
-        tile = next_job(worker, counters, ends)
-        if tile < 0:
-            break
+    work, sum_scratch = make_workspace(stride), scratch(size * LANES)
+    state = work.state
+    for tile in jobs(worker, counters, ends):
         first, last = start[tile], stops[tile]
         for k in range(first, last):
             slot_of[np.int64(entries[k] >> np.uint64(32))] = first_slot[tile] + k - first
@@ -286,7 +305,8 @@ def blend_backward(
             slot_of[np.int64(entries[k] >> np.uint64(32))] = -1
         if first == last:
             continue
-        image, left, top = corner_of(tile, width, height)
+        corner = corner_of(tile, width, height)
+        image, left, top = corner
         columns, lines = min(TILE_WIDTH, width - left), min(TILE_HEIGHT, height - top)
         if columns < TILE_WIDTH or lines < TILE_HEIGHT:
             for b in range(BLOCKS):
@@ -307,9 +327,7 @@ def blend_backward(
                 state[to] = ONE
                 state[to + LANES] = whole
         tile_backward(
-            geom, image * gaussians, colors, image // color_repeat * gaussians, entries,
-            first, last, left + 0.5, top + 0.5,
-            state, offsets, blocks, ids, slopes, sum_scratch, slots, first_slot[tile], slot_size,
+            scene, corner, first, last, work, sum_scratch, slots, first_slot[tile], slot_size,
             channels,
         )  # fmt: skip
 
@@ -324,10 +342,7 @@ def background_backward(worker, counters, ends, v_images, remaining, v_lines):
         v_lines: out, float64 (I, H, D).
     """
     _, height, width, size = v_images.shape
-    while True:
-        job = next_job(worker, counters, ends)
-        if job < 0:
-            break
+    for job in jobs(worker, counters, ends):
         i, y = job // height, job % height
         sums = v_lines[i, y]
         sums[:] = 0.0
@@ -383,10 +398,7 @@ def reduce_slots(
     pieces = max(1, gaussians // PIECE)
     groups = (MOMENTS + channels + GROUP - 1) // GROUP
     sums = np.empty(groups * GROUP, np.float64)
-    while True:
-        piece = next_job(worker, counters, ends)
-        if piece < 0:
-            break
+    for piece in jobs(worker, counters, ends):
         begin, stop = piece * gaussians // pieces, (piece + 1) * gaussians // pieces
         for i in range(images):
             clear_first(v_opacities, i, images, begin, stop)

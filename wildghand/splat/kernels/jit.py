@@ -6,42 +6,14 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
-from typing import Any
 
-from hwp_bench.base import kernels as compiler
+from hwp_bench.base.kernels import compiled, helper
 from wildghand.splat.kernels.vectors import atomic_add_one
 
-
-class Kernel:
-    """A compiled function that Python calls; it releases the interpreter lock."""
-
-    def __init__(self, function: Callable[..., Any]) -> None:
-        functools.update_wrapper(self, function)
-        self.dispatcher = compiler.compiled(nogil=True)(function)
-
-    def __call__(self, *args: Any) -> Any:
-        """Runs the machine code; compiles it if need be."""
-        return self.dispatcher(*args)
-
-    def on_disk(self) -> bool:
-        """Whether the cache holds a version of this kernel, as far as can be told."""
-        return compiler.on_disk(self.dispatcher)
-
-    def compiled_here(self) -> int:
-        """How many versions this process had to compile."""
-        return len(self.dispatcher.signatures) - sum(self.dispatcher.stats.cache_hits.values())
-
-
-def kernel(function: Callable[..., Any]) -> Kernel:
-    """Decorator: compiles a function that Python calls."""
-    return Kernel(function)
-
-
-def inline(function: Callable[..., Any]) -> Any:
-    """Decorator: compiles a function into the kernels that call it; Python cannot call it."""
-    return compiler.helper(function, forceinline=True)
-
+#: Decorator: a function that Python calls; it releases the interpreter lock.
+kernel = compiled(nogil=True)
+#: Decorator: a function that is compiled into the kernels that call it; Python cannot call it.
+inline = functools.partial(helper, forceinline=True)
 
 #: Numbers between two threads' counters: one cache line each.
 SPACING = 8
@@ -64,3 +36,13 @@ def next_job(worker, counters, ends):
             if job < size:
                 return ends[owner] + job
     return -1
+
+
+@inline
+def jobs(worker, counters, ends):
+    """The jobs that a thread gets, one after the other; see `next_job`."""
+    while True:
+        job = next_job(worker, counters, ends)
+        if job < 0:
+            break
+        yield job

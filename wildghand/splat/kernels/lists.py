@@ -12,11 +12,12 @@ the same lists.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from wildghand.splat.kernels import tiles as at
-from wildghand.splat.kernels.jit import inline, kernel, next_job
+from wildghand.splat.kernels.jit import inline, jobs, kernel
 from wildghand.splat.kernels.tiles import LOG2_MIN_ALPHA, TILE_HEIGHT, TILE_WIDTH
 from wildghand.splat.kernels.vectors import prefetch
 
@@ -24,8 +25,6 @@ from wildghand.splat.kernels.vectors import prefetch
 _BITS = 11
 _DIGITS = 1 << _BITS
 _MASK = np.uint32(_DIGITS - 1)
-_FIRST = np.uint32(_BITS)
-_SECOND = np.uint32(2 * _BITS)
 
 
 @kernel
@@ -42,10 +41,7 @@ def sort_by_depth(worker, counters, ends, depths, rows, order, spare, visible, c
     """
     gaussians = depths.shape[1]
     digits = np.empty((3, _DIGITS), np.int32)
-    while True:
-        i = next_job(worker, counters, ends)
-        if i < 0:
-            break
+    for i in jobs(worker, counters, ends):
         first, second = order[i], spare[i]
         bits = depths[i].view(np.uint32)
         digits[:] = 0
@@ -55,30 +51,21 @@ def sort_by_depth(worker, counters, ends, depths, rows, order, spare, visible, c
             if value != 0:
                 second[m] = n
                 m += 1
-                digits[0, value & _MASK] += 1
-                digits[1, (value >> _FIRST) & _MASK] += 1
-                digits[2, value >> _SECOND] += 1
+                for d in range(3):
+                    digits[d, (value >> np.uint32(d * _BITS)) & _MASK] += 1
         for d in range(3):
             before = 0
             for k in range(_DIGITS):
                 number = digits[d, k]
                 digits[d, k] = before
                 before += number
-        for k in range(m):
-            n = second[k]
-            d = bits[n] & _MASK
-            first[digits[0, d]] = n
-            digits[0, d] += 1
-        for k in range(m):
-            n = first[k]
-            d = (bits[n] >> _FIRST) & _MASK
-            second[digits[1, d]] = n
-            digits[1, d] += 1
-        for k in range(m):
-            n = second[k]
-            d = bits[n] >> _SECOND
-            first[digits[2, d]] = n
-            digits[2, d] += 1
+            # Each pass moves the places into the other array; the last one ends in `order`.
+            source, target = (first, second) if d == 1 else (second, first)
+            for k in range(m):
+                n = source[k]
+                digit = (bits[n] >> np.uint32(d * _BITS)) & _MASK
+                target[digits[d, digit]] = n
+                digits[d, digit] += 1
         visible[i] = m
         chunks = chunk_rows.shape[1] - 1
         total = 0
@@ -135,29 +122,33 @@ def find_spans(geom, row, last_column, first, number, spans, span):
         spans[span + r] = packed
 
 
+class Walk(NamedTuple):
+    """The visible Gaussians in order, in K chunks, with the tiles that each touches."""
+
+    order: np.ndarray  # int32 (I, N)
+    visible: np.ndarray  # int64 (I,)
+    chunk_rows: np.ndarray  # int64 (I, K + 1), see `sort_by_depth`
+    image_spans: np.ndarray  # int64 (I + 1,), where each image's spans start
+    heads: np.ndarray  # uint32 (I, N); first tile row << 16 | tile rows, in the sorted order
+    spans: np.ndarray  # uint32, see `find_spans`
+    tiles_x: int  # tiles side by side
+
+
 @kernel
-def count_tiles(
-    worker, counters, ends,
-    geom, order, visible, chunk_rows, image_spans, tiles_x, width, spans, heads,
-    counts, entry_count,
-):  # fmt: skip
+def count_tiles(worker, counters, ends, geom, walk, width, counts, entry_count):
     """Finds the tiles of every visible Gaussian and counts, chunk by chunk.
 
     Args:
         geom: flat float32 (I, N, 16).
-        image_spans: int64 (I + 1,); where each image's spans start.
-        heads: out, uint32 (I, N); first tile row << 16 | tile rows, in the sorted order.
+        walk: in order, out heads and spans.
         counts: out, int32 (I, K, tiles of an image).
         entry_count: in zeros, out, int32 (I, N); tiles that each Gaussian touches.
     """
+    order, visible, chunk_rows, image_spans, heads, spans, tiles_x = walk
     gaussians = order.shape[1]
     chunks = counts.shape[1]
-    while True:
-        job = next_job(worker, counters, ends)
-        if job < 0:
-            break
-        i = job // chunks
-        c = job - i * chunks
+    for job in jobs(worker, counters, ends):
+        i, c = job // chunks, job % chunks
         number = counts[i, c]
         number[:] = 0
         span = image_spans[i] + chunk_rows[i, c]
@@ -222,25 +213,18 @@ def place_tiles(counts, entry_count, start, first_entry):
 
 
 @kernel
-def fill_tiles(
-    worker, counters, ends,
-    order, visible, heads, chunk_rows, image_spans, spans, places, first_entry, tiles_x,
-    entries,
-):  # fmt: skip
+def fill_tiles(worker, counters, ends, walk, places, first_entry, entries):
     """Writes the lists.
 
     Args:
         entries: out, uint64 (E,); tile by tile, front to back: the Gaussian in the low half, in
             the high half the number of the entry in order of Gaussians.
     """
+    order, visible, chunk_rows, image_spans, heads, spans, tiles_x = walk
     gaussians = order.shape[1]
     chunks = places.shape[1]
-    while True:
-        job = next_job(worker, counters, ends)
-        if job < 0:
-            break
-        i = job // chunks
-        c = job - i * chunks
+    for job in jobs(worker, counters, ends):
+        i, c = job // chunks, job % chunks
         place = places[i, c]
         span = image_spans[i] + chunk_rows[i, c]
         for k in range(c * visible[i] // chunks, (c + 1) * visible[i] // chunks):

@@ -2,6 +2,9 @@
 
 float64 because a needle's projected covariance is nearly singular, and because a pixel
 coordinate in float32 is off by up to 3e-5 px, which an image error of 1e-5 does not allow.
+
+The arrays of a call hold one Gaussian after another, (x, y, z), (x, y, z)...; the projection
+works on vectors (x, x, ...), (y, y, ...). Shuffles in registers do the exchange.
 """
 
 # Numba infers the types.
@@ -10,40 +13,184 @@ coordinate in float32 is off by up to 3e-5 px, which an image error of 1e-5 does
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from llvmlite import ir
+from numba import types
 
 from wildghand.splat import conventions as rules
-from wildghand.splat.kernels import tiles as at
-from wildghand.splat.kernels.groups import (
-    GROUP,
-    add_columns,
-    by,
-    clamp,
-    cross,
-    dot,
-    fill_exact,
+from wildghand.splat.kernels.jit import inline, jobs, kernel
+from wildghand.splat.kernels.tiles import ROW, TILE_HEIGHT
+from wildghand.splat.kernels.triples import by, cross, dot, plus, scaled, times
+from wildghand.splat.kernels.vectors import (
+    Call,
+    Vector,
+    ceil,
+    floor,
     keep,
-    lane_index,
-    load1,
-    load2,
-    load3,
-    load4,
-    log2,
-    plus,
-    rotation,
-    round32,
-    scaled,
-    store_column,
-    store_pairs,
-    store_rows,
-    times,
-    total,
+    lowered,
+    make_constant,
+    make_fill,
+    select,
+    shuffle,
+    split_exponent,
+    square_root,
 )
-from wildghand.splat.kernels.jit import inline, kernel, next_job
-from wildghand.splat.kernels.tiles import TILE_HEIGHT
-from wildghand.splat.kernels.vectors import ceil, floor, select, square_root
+
+#: Gaussians that are projected together.
+GROUP = 8
+#: One float64 for each of them.
+EXACT = Vector(types.float64, GROUP)
+
+_SINGLE, _WHOLE = (ir.VectorType(kind, GROUP) for kind in (ir.FloatType(), ir.IntType(32)))
+_LARGEST = 3.4028234663852886e38
+
+fill_exact = make_fill(EXACT)
+#: 0, 1, ... 7.
+lane_index = make_constant(EXACT, range(GROUP))
+
+
+def make_load_columns(columns: int) -> Any:
+    """An intrinsic `load(array, flat_index)` for 8 rows of `columns` float32.
+
+    It gives a tuple with one float64 vector for each column.
+    """
+
+    @lowered(lambda array, index: types.UniTuple(EXACT, columns))
+    def load_columns(code: Call, array: Any, index: Any) -> ir.Value:
+        whole = code.load(array, index, ir.VectorType(ir.FloatType(), GROUP * columns))
+        parts = []
+        for column in range(columns):
+            part = shuffle(code.builder, whole, whole, range(column, GROUP * columns, columns))
+            parts.append(code.builder.fpext(part, EXACT.llvm))
+        return code.pack(parts)
+
+    return load_columns
+
+
+load1, load2, load3, load4 = (make_load_columns(columns) for columns in range(1, 5))
+
+
+def _as_rows(builder: ir.IRBuilder, parts: Sequence[ir.Value]) -> ir.Value:
+    """One vector with the columns row by row."""
+    columns, joined = len(parts), list(parts)
+    while len(joined) > 1:
+        joined += joined[-1:] * (len(joined) % 2)
+        both = range(2 * joined[0].type.count)
+        pairs = zip(joined[::2], joined[1::2], strict=True)
+        joined = [shuffle(builder, first, second, both) for first, second in pairs]
+    lanes = [column * GROUP + row for row in range(GROUP) for column in range(columns)]
+    return shuffle(builder, joined[0], joined[0], lanes)
+
+
+@lowered(lambda array, index, values: types.void)
+def add_columns(code: Call, array: Any, index: Any, values: Any) -> None:
+    """Adds a tuple of float64 vectors to 8 rows of a float32 array; saturates, never inf."""
+    builder, rows = code.builder, _as_rows(code.builder, code.unpack(values))
+    single = ir.VectorType(ir.FloatType(), rows.type.count)
+    value = builder.fadd(builder.fpext(code.load(array, index, single), rows.type), rows)
+    for sign, bound in (("<", _LARGEST), (">", -_LARGEST)):
+        limit = ir.Constant(value.type, [bound] * value.type.count)
+        value = builder.select(builder.fcmp_ordered(sign, limit, value), limit, value)
+    code.store(array, index, builder.fptrunc(value, single))
+
+
+@lowered(lambda array, index, values: types.void)
+def store_columns(code: Call, array: Any, index: Any, values: Any) -> None:
+    """Writes a tuple of float64 vectors to 8 rows of an array of float32 or int32."""
+    if code.sig.args[0].dtype == types.float32:
+        parts = [code.builder.fptrunc(part, _SINGLE) for part in code.unpack(values)]
+    else:
+        parts = [code.builder.fptosi(part, _WHOLE) for part in code.unpack(values)]
+    code.store(array, index, _as_rows(code.builder, parts))
+
+
+@lowered(
+    lambda array, index, values: (
+        types.void if isinstance(values, types.UniTuple) and values.count == 2 * GROUP else None
+    )
+)
+def store_rows(code: Call, array: Any, index: Any, values: Any) -> None:
+    """`store_columns` of 16 columns, of which a single shuffle would be slow."""
+    builder = code.builder
+    parts = [builder.fptrunc(part, _SINGLE) for part in code.unpack(values)]
+    # Vector k holds values k and k + 8 of all rows; three rounds of exchanging the blocks
+    # off the diagonal transpose both halves.
+    wide = 2 * GROUP
+    rows = [shuffle(builder, parts[k], parts[k + GROUP], range(wide)) for k in range(GROUP)]
+    for step in (4, 2, 1):
+        keep = [wide + lane - step if lane & step else lane for lane in range(wide)]
+        give = [wide + lane if lane & step else lane + step for lane in range(wide)]
+        done = list(rows)
+        for k in range(GROUP):
+            if not k & step:
+                done[k] = shuffle(builder, rows[k], rows[k + step], keep)
+                done[k + step] = shuffle(builder, rows[k], rows[k + step], give)
+        rows = done
+    pointer = code.place(array, index, rows[0].type)
+    for k, row in enumerate(rows):
+        builder.store(row, builder.gep(pointer, [ir.Constant(ir.IntType(32), k)]), align=4)
+
+
+@lowered(lambda value: value)
+def round32(code: Call, value: Any) -> ir.Value:
+    """float64 lanes rounded to the precision of float32."""
+    return code.builder.fpext(code.builder.fptrunc(value, _SINGLE), EXACT.llvm)
+
+
+@lowered(lambda value: types.float64)
+def total(code: Call, value: Any) -> ir.Value:
+    """Sum of the lanes of a float64 vector, in a fixed order."""
+    width = GROUP
+    while width > 1:
+        width //= 2
+        low = shuffle(code.builder, value, value, range(width))
+        high = shuffle(code.builder, value, value, range(width, 2 * width))
+        value = code.builder.fadd(low, high)
+    return code.builder.extract_element(value, ir.Constant(ir.IntType(32), 0))
+
+
+_TWO_OVER_LN2 = 2.0 / math.log(2.0)
+
+
+@inline
+def log2(x):
+    """Base-2 logarithm in every lane, to 1e-12; x positive."""
+    mantissa, exponent = split_exponent(x)
+    t = (mantissa - 1.0) / (mantissa + 1.0)
+    s = t * t
+    series = s * (1.0 / 15.0) + 1.0 / 13.0
+    series = s * series + 1.0 / 11.0
+    series = s * series + 1.0 / 9.0
+    series = s * series + 1.0 / 7.0
+    series = s * series + 1.0 / 5.0
+    series = s * series + 1.0 / 3.0
+    series = s * series + 1.0
+    return exponent + t * series * _TWO_OVER_LN2
+
+
+@inline
+def clamp(x, low, high):
+    """x brought into [low, high]."""
+    x = select(x < low, low, x)
+    return select(x > high, high, x)
+
+
+@inline
+def rotation(quat):
+    """Rotation matrix of a unit quaternion, row by row."""
+    w, x, y, z = quat
+    xx, yy, zz = x * x, y * y, z * z
+    xy, xz, yz, wx, wy, wz = x * y, x * z, y * z, w * x, w * y, w * z
+    one = fill_exact(1.0)
+    return (
+        (one - (yy + zz) * 2.0, (xy - wz) * 2.0, (xz + wy) * 2.0),
+        ((xy + wz) * 2.0, one - (xx + zz) * 2.0, (yz - wx) * 2.0),
+        ((xz - wy) * 2.0, (yz + wx) * 2.0, one - (xx + yy) * 2.0),
+    )
+
 
 #: Numbers of a camera: rotation row by row, translation, fx, fy, cx, cy, and the range of the
 #: tangents of view angles within which the perspective's Jacobian is followed, x then y.
@@ -86,20 +233,29 @@ def prepare_cameras(viewmats, Ks, width, height, rows):
 
 
 @inline
-def to_camera(camera, row, x, y, z):
-    """One coordinate in camera axes; `row` 0, 1 or 2."""
-    turned = x * camera[3 * row] + y * camera[3 * row + 1] + z * camera[3 * row + 2]
-    return turned + camera[9 + row]
+def camera_row(camera, row):
+    """A row of the camera's rotation."""
+    return (camera[3 * row], camera[3 * row + 1], camera[3 * row + 2])
+
+
+@inline
+def to_camera(camera, mean):
+    """Means in camera axes."""
+    return (
+        dot(mean, camera_row(camera, 0)) + camera[9],
+        dot(mean, camera_row(camera, 1)) + camera[10],
+        dot(mean, camera_row(camera, 2)) + camera[11],
+    )
 
 
 @inline
 def jacobian_row(camera, axis, scale, tangent):
     """One row of J R: the perspective's Jacobian times the camera's rotation."""
-    first = 3 * axis
+    a, b = camera_row(camera, axis), camera_row(camera, 2)
     return (
-        scale * (camera[first] - tangent * camera[6]),
-        scale * (camera[first + 1] - tangent * camera[7]),
-        scale * (camera[first + 2] - tangent * camera[8]),
+        scale * (a[0] - tangent * b[0]),
+        scale * (a[1] - tangent * b[1]),
+        scale * (a[2] - tangent * b[2]),
     )
 
 
@@ -178,6 +334,26 @@ def entry_of(shared, image, images):
 
 
 @inline
+def load_group(ellipsoids, image, images, n):
+    """Means, quaternions and scales of 8 Gaussians from the n-th on, as an image reads them."""
+    means, quats, scales = ellipsoids
+    gaussians = means.shape[1]
+    return (
+        load3(means, (entry_of(means, image, images) * gaussians + n) * 3),
+        load4(quats, (entry_of(quats, image, images) * gaussians + n) * 4),
+        load3(scales, (entry_of(scales, image, images) * gaussians + n) * 3),
+    )
+
+
+@inline
+def unit(quat):
+    """A quaternion of length 1, and what it was multiplied by."""
+    w, x, y, z = quat
+    over = 1.0 / square_root(w * w + x * x + y * y + z * z)
+    return (w * over, x * over, y * over, z * over), over
+
+
+@inline
 def flatten(camera, x, y, z, turn, size, eps2d):
     """`OnPlane` of Gaussians at x, y, z in camera axes."""
     inverse = 1.0 / z
@@ -202,24 +378,25 @@ def flatten(camera, x, y, z, turn, size, eps2d):
 @inline
 def project_group(mean, quat, size, alpha, usable, camera, view, projected, to):
     """Projects 8 Gaussians and writes them to the flat index `to` of `projected`."""
-    x = to_camera(camera, 0, mean[0], mean[1], mean[2])
-    y = to_camera(camera, 1, mean[0], mean[1], mean[2])
-    z = to_camera(camera, 2, mean[0], mean[1], mean[2])
+    x, y, z = to_camera(camera, mean)
     seen = (z > view.near) & (z < view.far) & (usable > 0.0)
     z = select(seen, z, 1.0)
-    qw, qx, qy, qz = quat
-    norm = qw * qw + qx * qx + qy * qy + qz * qz
-    seen = seen & (norm > 0.0)
-    over = 1.0 / square_root(norm)
-    turn = rotation(qw * over, qx * over, qy * over, qz * over)
-    plane = flatten(camera, x, y, z, turn, size, view.eps2d)
+    quat, over = unit(quat)
+    seen = seen & (over < math.inf)
+    plane = flatten(camera, x, y, z, rotation(quat), size, view.eps2d)
     if view.antialiased:
         ratio = square_root(plane.area / plane.det)
         alpha = alpha * ratio
-        store_column(projected.compensations, to, select(ratio > 0.0, ratio, 0.0))
+        store_columns(projected.compensations, to, (select(ratio > 0.0, ratio, 0.0),))
     seen = seen & (plane.det > 0.0) & (alpha >= _MIN_ALPHA) & (alpha < _MAX_OPACITY)
     log_alpha = log2(select(seen, alpha, 1.0))
     store_visible(seen, z, log_alpha, plane, camera, view, projected, to)
+
+
+@inline
+def tile_row(y, height):
+    """The row of tiles that a place on the image plane lies in, or the nearest."""
+    return floor(clamp(y - 0.5, 0.0, height - 1.0) * (1.0 / TILE_HEIGHT))
 
 
 @inline
@@ -236,41 +413,20 @@ def store_visible(seen, z, log_alpha, plane, camera, view, projected, to):
     seen = seen & (reach_x < _MAX_REACH) & (reach_y < _MAX_REACH) & (along < _MAX_ALONG)
     seen = seen & (px + reach_x >= 0.5) & (px - reach_x <= view.width - 0.5)
     seen = seen & (py + reach_y >= 0.5) & (py - reach_y <= view.height - 0.5)
-    first = floor(clamp(py - reach_y - 0.5, 0.0, view.height - 1.0) * (1.0 / TILE_HEIGHT))
-    last = floor(clamp(py + reach_y - 0.5, 0.0, view.height - 1.0) * (1.0 / TILE_HEIGHT))
+    first = tile_row(py - reach_y, view.height)
+    rows = tile_row(py + reach_y, view.height) - first + 1.0
     shear = 0.0 - B / C
     px_high, py_high, shear_high = round32(px), round32(py), round32(shear)
     zero = fill_exact(0.0)
-    store_rows(
-        projected.geom,
-        to * at.ROW,
-        (
-            select(seen, px_high, zero),
-            select(seen, py_high, zero),
-            select(seen, px - px_high, zero),
-            select(seen, py - py_high, zero),
-            select(seen, shear_high, zero),
-            select(seen, shear - shear_high, zero),
-            select(seen, along, zero),
-            select(seen, across, zero),
-            select(seen, log_alpha, zero),
-            select(seen, reach_x, zero),
-            select(seen, reach_y, zero),
-            select(seen, reach_x * (B / A), zero),
-            select(seen, first, zero),
-            select(seen, last - first + 1.0, zero),
-            zero,
-            zero,
-        ),
-    )
-    store_column(projected.depths, to, select(seen, z, 0.0))
-    store_column(projected.rows, to, select(seen, last - first + 1.0, 0.0))
-    store_pairs(
-        projected.radii,
-        2 * to,
-        select(seen, clamp(ceil(reach_x), 0.0, _MAX_RADIUS), 0.0),
-        select(seen, clamp(ceil(reach_y), 0.0, _MAX_RADIUS), 0.0),
-    )
+    row = (
+        px_high, py_high, px - px_high, py - py_high, shear_high, shear - shear_high,
+        along, across, log_alpha, reach_x, reach_y, reach_x * (B / A), first, rows, zero, zero,
+    )  # fmt: skip
+    store_rows(projected.geom, to * ROW, keep(seen, row))
+    store_columns(projected.depths, to, keep(seen, (z,)))
+    store_columns(projected.rows, to, keep(seen, (rows,)))
+    radii = (clamp(ceil(reach_x), 0.0, _MAX_RADIUS), clamp(ceil(reach_y), 0.0, _MAX_RADIUS))
+    store_columns(projected.radii, 2 * to, keep(seen, radii))
 
 
 @inline
@@ -288,7 +444,7 @@ def project(worker, counters, ends, ellipsoids, opacities, colors, cameras, view
     """Projects every Gaussian of every image.
 
     Args:
-        worker, counters, ends: see `next_job`; a job is a piece of an image.
+        worker, counters, ends: see `jit.jobs`; a job is a piece of an image.
         ellipsoids: `Ellipsoids`.
         opacities: float32 (S, N).
         colors: float32 (S, N, D), to see which are finite.
@@ -297,32 +453,21 @@ def project(worker, counters, ends, ellipsoids, opacities, colors, cameras, view
         projected: out, `Projected`; compensations only if antialiased.
     """
     images, gaussians = projected.depths.shape
-    means, quats, scales = ellipsoids
     pieces = max(1, gaussians // PIECE)
     usable = np.empty(GROUP, np.float32)
-    while True:
-        job = next_job(worker, counters, ends)
-        if job < 0:
-            break
-        image = job // pieces
-        piece = job - image * pieces
-        camera = cameras[image]
-        of_means = entry_of(means, image, images) * gaussians
-        of_quats = entry_of(quats, image, images) * gaussians
-        of_scales = entry_of(scales, image, images) * gaussians
+    for job in jobs(worker, counters, ends):
+        image, piece = job // pieces, job % pieces
         of_opacities = entry_of(opacities, image, images) * gaussians
-        of_colors = entry_of(colors, image, images)
         stop = (piece + 1) * gaussians // pieces
         for start in range(piece * gaussians // pieces, stop, GROUP):
             n = min(start, stop - GROUP)
-            mark_usable(colors, of_colors, n, usable)
+            mark_usable(colors, entry_of(colors, image, images), n, usable)
             (may,) = load1(usable, 0)
             (alpha,) = load1(opacities, of_opacities + n)
+            mean, quat, size = load_group(ellipsoids, image, images, n)
             project_group(
-                load3(means, (of_means + n) * 3),
-                load4(quats, (of_quats + n) * 4),
-                load3(scales, (of_scales + n) * 3),
-                alpha, may, camera, view, projected, image * gaussians + n,
+                mean, quat, size, alpha, may, cameras[image], view, projected,
+                image * gaussians + n,
             )  # fmt: skip
 
 
@@ -351,33 +496,25 @@ def project_backward(
     with_cameras = v_cameras.shape[1] > 0
     zero = fill_exact(0.0)
     nothing = (zero, zero, zero)
-    while True:
-        piece = next_job(worker, counters, ends)
-        if piece < 0:
-            break
+    for piece in jobs(worker, counters, ends):
         begin, stop = piece * gaussians // pieces, (piece + 1) * gaussians // pieces
         for i in range(images):
             camera = cameras[i]
-            clear_first(gradients.means, i, images, begin, stop)
-            clear_first(gradients.quats, i, images, begin, stop)
-            clear_first(gradients.scales, i, images, begin, stop)
-            of_means = entry_of(ellipsoids.means, i, images) * gaussians
-            of_quats = entry_of(ellipsoids.quats, i, images) * gaussians
-            of_scales = entry_of(ellipsoids.scales, i, images) * gaussians
+            for gradient in gradients:
+                clear_first(gradient, i, images, begin, stop)
+            of_means = entry_of(gradients.means, i, images) * gaussians
+            of_quats = entry_of(gradients.quats, i, images) * gaussians
+            of_scales = entry_of(gradients.scales, i, images) * gaussians
             sums = (nothing, nothing, nothing, nothing)
             for start in range(begin, stop, GROUP):
                 first = min(start, stop - GROUP)
                 (depth,) = load1(depths, i * gaussians + first)
                 # The last group of a piece reaches back; those that it repeats count once.
                 seen = (depth > 0.0) & (lane_index() >= np.float64(start - first))
-                mean = load3(ellipsoids.means, (of_means + first) * 3)
+                mean, quat, size = load_group(ellipsoids, i, images, first)
                 plane, moved, v_quat, v_size, v_t = group_backward(
-                    seen,
-                    mean,
-                    load4(ellipsoids.quats, (of_quats + first) * 4),
-                    load3(ellipsoids.scales, (of_scales + first) * 3),
-                    camera, view, upstream, i * gaussians + first,
-                )  # fmt: skip
+                    seen, mean, quat, size, camera, view, upstream, i * gaussians + first
+                )
                 add_columns(gradients.means, (of_means + first) * 3, from_camera(camera, moved))
                 add_columns(gradients.quats, (of_quats + first) * 4, v_quat)
                 add_columns(gradients.scales, (of_scales + first) * 3, v_size)
@@ -386,21 +523,17 @@ def project_backward(
             if with_cameras:
                 place = v_cameras[i, piece]
                 for row in range(4):
-                    place[3 * row] = total(sums[row][0])
-                    place[3 * row + 1] = total(sums[row][1])
-                    place[3 * row + 2] = total(sums[row][2])
+                    for k in range(3):
+                        place[3 * row + k] = total(sums[row][k])
 
 
 @inline
 def group_backward(seen, mean, quat, size, camera, view, upstream, at):
     """Gradients of 8 Gaussians from those at the flat index `at`; zeros where not seen."""
-    x = to_camera(camera, 0, mean[0], mean[1], mean[2])
-    y = to_camera(camera, 1, mean[0], mean[1], mean[2])
-    z = select(seen, to_camera(camera, 2, mean[0], mean[1], mean[2]), 1.0)
-    qw, qx, qy, qz = quat
-    over = 1.0 / square_root(qw * qw + qx * qx + qy * qy + qz * qz)
-    qw, qx, qy, qz = qw * over, qx * over, qy * over, qz * over
-    turn = rotation(qw, qx, qy, qz)
+    x, y, z = to_camera(camera, mean)
+    z = select(seen, z, 1.0)
+    quat, over = unit(quat)
+    turn = rotation(quat)
     plane = flatten(camera, x, y, z, turn, size, view.eps2d)
 
     v_log_a, v_log_c, v_shear = load3(upstream.shapes, 3 * at)
@@ -411,12 +544,13 @@ def group_backward(seen, mean, quat, size, camera, view, upstream, at):
         v_u, v_v = plus(v_u, more_u), plus(v_v, more_v)
     v_size = plus(scaled(v_u, plane.w[0]), scaled(v_v, plane.w[1]))
     v_wx, v_wy = scaled(v_u, size), scaled(v_v, size)
+    t_x, t_y = plane.t
     v_turn = (
-        plus(by(v_wx, plane.t[0][0]), by(v_wy, plane.t[1][0])),
-        plus(by(v_wx, plane.t[0][1]), by(v_wy, plane.t[1][1])),
-        plus(by(v_wx, plane.t[0][2]), by(v_wy, plane.t[1][2])),
+        plus(by(v_wx, t_x[0]), by(v_wy, t_y[0])),
+        plus(by(v_wx, t_x[1]), by(v_wy, t_y[1])),
+        plus(by(v_wx, t_x[2]), by(v_wy, t_y[2])),
     )
-    g_w, g_x, g_y, g_z = quaternion_gradient((qw, qx, qy, qz), over, v_turn)
+    v_quat = quaternion_gradient(quat, over, v_turn)
     v_tx = (dot(turn[0], v_wx), dot(turn[1], v_wx), dot(turn[2], v_wx))
     v_ty = (dot(turn[0], v_wy), dot(turn[1], v_wy), dot(turn[2], v_wy))
 
@@ -425,14 +559,8 @@ def group_backward(seen, mean, quat, size, camera, view, upstream, at):
     if upstream.depths.size > 0:
         (v_depth,) = load1(upstream.depths, at)
         v_z = v_z + v_depth
-    zero = fill_exact(0.0)
-    v_quat = (
-        select(seen, g_w, zero),
-        select(seen, g_x, zero),
-        select(seen, g_y, zero),
-        select(seen, g_z, zero),
-    )
-    return plane, keep(seen, (v_x, v_y, v_z)), v_quat, keep(seen, v_size), (v_tx, v_ty)
+    moved = keep(seen, (v_x, v_y, v_z))
+    return plane, moved, keep(seen, v_quat), keep(seen, v_size), (v_tx, v_ty)
 
 
 @inline
@@ -497,8 +625,8 @@ def position_gradient(x, y, plane, camera, v_px, v_py, v_tx, v_ty):
     scale_x, scale_y = inverse * fx, inverse * fy
     v_scale_x = dot(v_tx, plane.t[0]) / scale_x
     v_scale_y = dot(v_ty, plane.t[1]) / scale_y
-    along_x = v_tx[0] * camera[6] + v_tx[1] * camera[7] + v_tx[2] * camera[8]
-    along_y = v_ty[0] * camera[6] + v_ty[1] * camera[7] + v_ty[2] * camera[8]
+    along_x = dot(v_tx, camera_row(camera, 2))
+    along_y = dot(v_ty, camera_row(camera, 2))
     tan_x, tan_y = plane.tangent
     free_x = (tan_x >= camera[16]) & (tan_x <= camera[17])
     free_y = (tan_y >= camera[18]) & (tan_y <= camera[19])
@@ -512,12 +640,7 @@ def position_gradient(x, y, plane, camera, v_px, v_py, v_tx, v_ty):
 @inline
 def from_camera(camera, moved):
     """Gradient of a mean in the world from that in camera axes."""
-    v_x, v_y, v_z = moved
-    return (
-        v_x * camera[0] + v_y * camera[3] + v_z * camera[6],
-        v_x * camera[1] + v_y * camera[4] + v_z * camera[7],
-        v_x * camera[2] + v_y * camera[5] + v_z * camera[8],
-    )
+    return times(moved, (camera_row(camera, 0), camera_row(camera, 1), camera_row(camera, 2)))
 
 
 @inline
@@ -526,13 +649,11 @@ def add_camera(sums, seen, mean, moved, plane, camera, v_t):
 
     J R depends on R through its own row and, by the tangent, the third.
     """
-    zero = fill_exact(0.0)
     v_x, v_y, v_z = moved
     of_x = keep(seen, by(v_t[0], plane.inverse * camera[12]))
     of_y = keep(seen, by(v_t[1], plane.inverse * camera[13]))
-    held = plus(
-        by(of_x, select(seen, plane.held[0], zero)), by(of_y, select(seen, plane.held[1], zero))
-    )
+    held_x, held_y = keep(seen, plane.held)
+    held = plus(by(of_x, held_x), by(of_y, held_y))
     return (
         plus(sums[0], plus(by(mean, v_x), of_x)),
         plus(sums[1], plus(by(mean, v_y), of_y)),

@@ -30,18 +30,20 @@ import llvmlite.binding
 import numpy as np
 from llvmlite import ir
 from numba import types
-from numba.core import cgutils, config
+from numba.core import config
 from numba.extending import overload
 
 from wildghand.splat import conventions as rules
 from wildghand.splat.kernels.jit import inline
 from wildghand.splat.kernels.vectors import (
+    Call,
     Vector,
     absolute,
     add_exponent,
     bits,
+    call,
     fma,
-    intrinsic,
+    lowered,
     make_constant,
     make_fill,
     make_load,
@@ -190,9 +192,7 @@ def enter_tile(geom, row, tile_x, tile_y, offsets, to):
 
 
 @inline
-def enter_batch(
-    geom, base, entries, start, stop, last, tile_x, tile_y, alive, offsets, blocks, ids, slopes
-):
+def enter_batch(geom, base, entries, start, stop, last, left, top, alive, work):
     """`enter_tile` for the entries from `start` to `stop`, ahead of blending them.
 
     Were each splat blended right away, the processor would guess wrongly how many blocks it has
@@ -203,10 +203,12 @@ def enter_batch(
             prefetch(geom, (base + np.int64(entries[k + BATCH] & GAUSSIAN)) * ROW)
         i = k - start
         g = np.int64(entries[k] & GAUSSIAN)
-        inside, slope = enter_tile(geom, (base + g) * ROW, tile_x, tile_y, offsets, 2 * BLOCKS * i)
-        blocks[i] = inside & alive
-        ids[i] = g
-        slopes[i] = slope
+        inside, slope = enter_tile(
+            geom, (base + g) * ROW, left + 0.5, top + 0.5, work.offsets, 2 * BLOCKS * i
+        )
+        work.blocks[i] = inside & alive
+        work.ids[i] = g
+        work.slopes[i] = slope
 
 
 @inline
@@ -282,21 +284,15 @@ def _count(channels):
     return lambda channels: channels
 
 
-@intrinsic
-def _load_tuple(typingctx: Any, array: Any, index: Any, channels: Any) -> Any:
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
-        data = context.make_array(sig.args[0])(context, builder, args[0]).data
-        values = []
-        for k in range(channels.count):
-            at = builder.add(args[1], ir.Constant(args[1].type, k))
-            values.append(builder.load(builder.gep(data, [at])))
-        return context.make_tuple(builder, sig.return_type, values)
-
-    return types.UniTuple(array.dtype, channels.count)(array, types.intp, channels), codegen
+@lowered(lambda array, index, channels: types.UniTuple(array.dtype, channels.count))
+def _load_tuple(code: Call, array: Any, index: Any, channels: Any) -> ir.Value:
+    builder = code.builder
+    places = [builder.add(index, ir.Constant(index.type, k)) for k in range(channels.type.count)]
+    return code.pack([builder.load(code.place(array, place)) for place in places])
 
 
 def fetch(colors, index, channels):
-    """The colour that starts at a flat index, to be handed to `paint` and `project`."""
+    """The colour that starts at a flat index, to be handed to `channel`."""
 
 
 @overload(fetch)
@@ -306,85 +302,48 @@ def _fetch(colors, index, channels):
     return lambda colors, index, channels: index
 
 
+def channel(colors, color, k):
+    """One channel of a colour that was fetched."""
+
+
+@overload(channel)
+def _channel(colors, color, k):
+    if _fixed(color):
+        return lambda colors, color, k: color[k]
+    return lambda colors, color, k: colors[color + k]
+
+
+@inline
 def paint(state, at, weight, colors, color, channels):
     """Adds weight * colour to the channels of a block; `at` is its first channel's vector."""
+    for k in range(count(channels)):
+        place = at + k * LANES
+        store(state, place, fma(weight, channel(colors, color, k), load_pixels(state, place)))
 
 
-@overload(paint)
-def _paint(state, at, weight, colors, color, channels):
-    if _fixed(channels):
-
-        def fixed(state, at, weight, colors, color, channels):
-            for k in range(len(color)):
-                place = at + k * LANES
-                store(state, place, fma(weight, color[k], load_pixels(state, place)))
-
-        return fixed
-
-    def loop(state, at, weight, colors, color, channels):
-        for k in range(channels):
-            place = at + k * LANES
-            store(state, place, fma(weight, colors[color + k], load_pixels(state, place)))
-
-    return loop
-
-
+@inline
 def project(state, at, colors, color, channels):
     """Sum over channels of colour * upstream gradient, for the pixels of a block."""
+    total = load_pixels(state, at) * channel(colors, color, 0)
+    for k in range(1, count(channels)):
+        total = fma(load_pixels(state, at + k * LANES), channel(colors, color, k), total)
+    return total
 
 
-@overload(project)
-def _project(state, at, colors, color, channels):
-    if _fixed(channels):
-
-        def fixed(state, at, colors, color, channels):
-            total = load_pixels(state, at) * color[0]
-            for k in range(1, len(color)):
-                total = fma(load_pixels(state, at + k * LANES), color[k], total)
-            return total
-
-        return fixed
-
-    def loop(state, at, colors, color, channels):
-        total = fill_pixels(ZERO)
-        for k in range(channels):
-            total = fma(load_pixels(state, at + k * LANES), colors[color + k], total)
-        return total
-
-    return loop
+@lowered(lambda channels: types.UniTuple(PIXELS, channels.count))
+def _zero_tuple(code: Call, channels: Any) -> ir.Value:
+    return code.pack([PIXELS.constant(0.0)] * channels.type.count)
 
 
-@intrinsic
-def _zero_tuple(typingctx: Any, channels: Any) -> Any:
-    kind = types.UniTuple(PIXELS, channels.count)
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
-        return context.make_tuple(builder, kind, [PIXELS.constant(0.0)] * channels.count)
-
-    return kind(channels), codegen
-
-
-@intrinsic
-def _gather_tuple(typingctx: Any, sums: Any, weight: Any, state: Any, at: Any) -> Any:
+@lowered(lambda state, at, weight, sums: sums)
+def _gather_tuple(code: Call, state: Any, at: Any, weight: Any, sums: Any) -> ir.Value:
     """sums[k] + weight * (vector k of state)."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
-        data = context.make_array(sig.args[2])(context, builder, args[2]).data
-        vector = PIXELS.llvm
-        function = cgutils.get_or_insert_function(
-            builder.module,
-            ir.FunctionType(vector, [vector] * 3),
-            f"llvm.fma.v{PIXELS.lanes}f32",
-        )
-        values = []
-        for k, total in enumerate(cgutils.unpack_tuple(builder, args[0], sums.count)):
-            place = builder.add(args[3], ir.Constant(args[3].type, k * PIXELS.lanes))
-            pointer = builder.bitcast(builder.gep(data, [place]), ir.PointerType(vector))
-            upstream = builder.load(pointer, align=4)
-            values.append(builder.call(function, [args[1], upstream, total]))
-        return context.make_tuple(builder, sums, values)
-
-    return sums(sums, weight, state, types.intp), codegen
+    values = []
+    for k, total in enumerate(code.unpack(sums)):
+        place = code.builder.add(at, ir.Constant(at.type, k * PIXELS.lanes))
+        upstream = code.load(state, place, PIXELS.llvm)
+        values.append(call(code.builder, "fma", PIXELS, [weight, upstream, total]))
+    return code.pack(values)
 
 
 def start_sums(sums, channels):
@@ -410,8 +369,8 @@ def add_to_sums(sums, weight, state, at):
 
 @overload(add_to_sums)
 def _add_to_sums(sums, weight, state, at):
-    if isinstance(sums, types.BaseTuple):
-        return lambda sums, weight, state, at: _gather_tuple(sums, weight, state, at)
+    if _fixed(sums):
+        return lambda sums, weight, state, at: _gather_tuple(state, at, weight, sums)
 
     def loop(sums, weight, state, at):
         for k in range(sums.size // LANES):
@@ -428,14 +387,13 @@ def finish_sums(slots, at, moments, sums):
 
 @overload(finish_sums)
 def _finish_sums(slots, at, moments, sums):
-    if isinstance(sums, types.BaseTuple):
+    if _fixed(sums):
         return lambda slots, at, moments, sums: store_sums(slots, at, moments + sums)
 
     def loop(slots, at, moments, sums):
         store_sums(slots, at, moments)
-        place = at + MOMENTS
         for k in range(sums.size // LANES):
-            store_sums(slots, place + k, (load_pixels(sums, k * LANES),))
+            store_sums(slots, at + MOMENTS + k, (load_pixels(sums, k * LANES),))
 
     return loop
 

@@ -13,24 +13,22 @@ asks for it by name with `fma`, because its forward and backward pass must agree
 
 from __future__ import annotations
 
+import functools
 import operator
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
 
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
-from numba.core.typing.templates import AbstractTemplate, infer_global, signature
-from numba.extending import intrinsic as numba_intrinsic
-from numba.extending import lower_builtin, models, register_model
-
-#: Untyped: the types that numba declares differ between its versions.
-intrinsic: Any = numba_intrinsic
+from numba.core.typing.templates import AbstractTemplate, Signature, infer_global, signature
+from numba.extending import intrinsic, lower_builtin, models, register_model
 
 #: What is declared for the CPU is asked before what is declared for every target. Numba's own
 #: templates of an operator are fifty, and each that does not fit words an error.
 _FIRST = {"target": "cpu"}
 _LLVM = {types.float32: ir.FloatType(), types.float64: ir.DoubleType()}
+_I32, _I64 = ir.IntType(32), ir.IntType(64)
 
 
 class Vector(types.Type):
@@ -71,385 +69,333 @@ class _MaskModel(models.PrimitiveModel):
         super().__init__(dmm, fe_type, ir.VectorType(ir.IntType(1), fe_type.lanes))
 
 
+def shuffle(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, lanes: Sequence[int]) -> ir.Value:
+    """The named lanes of `a` followed by `b`."""
+    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_I32, len(lanes)), [*lanes]))
+
+
 def splat(builder: ir.IRBuilder, value: ir.Value, lanes: int) -> ir.Value:
     """One value in every lane."""
-    vector = ir.VectorType(value.type, lanes)
-    one = builder.insert_element(
-        ir.Constant(vector, ir.Undefined), value, ir.Constant(ir.IntType(32), 0)
-    )
-    zeros = ir.Constant(ir.VectorType(ir.IntType(32), lanes), [0] * lanes)
-    return builder.shuffle_vector(one, ir.Constant(vector, ir.Undefined), zeros)
-
-
-def shuffle(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, lanes: list[int]) -> ir.Value:
-    """The named lanes of `a` followed by `b`."""
-    return builder.shuffle_vector(
-        a, b, ir.Constant(ir.VectorType(ir.IntType(32), len(lanes)), lanes)
-    )
-
-
-def widen(builder: ir.IRBuilder, value: ir.Value, kind: types.Type, vector: Vector) -> ir.Value:
-    """A vector from a value that is one already or a scalar."""
-    return value if isinstance(kind, Vector) else splat(builder, value, vector.lanes)
+    nothing = ir.Constant(ir.VectorType(value.type, lanes), ir.Undefined)
+    one = builder.insert_element(nothing, value, ir.Constant(_I32, 0))
+    return shuffle(builder, one, nothing, [0] * lanes)
 
 
 def vector_of(args: tuple[types.Type, ...]) -> Vector | None:
-    """The vector type of a pair (vector, vector) or (vector, scalar of its kind)."""
+    """The vector type of vectors and scalars of its kind; None if there is none."""
     vectors = [arg for arg in args if isinstance(arg, Vector)]
     if not vectors or any(arg not in (vectors[0], vectors[0].element) for arg in args):
         return None
     return vectors[0]
 
 
-def _define_operator(
-    function: Callable[..., Any], emit: Callable[..., ir.Value], kind: str
-) -> None:
-    """Teaches numba `function` for a vector and a vector or scalar."""
-
-    class Template(AbstractTemplate):
-        metadata = _FIRST
-
-        def generic(self, args: tuple[types.Type, ...], kws: dict[str, types.Type]) -> Any:
-            vector = vector_of(args) if not kws else None
-            if vector is None:
-                return None
-            return signature(Mask(vector.lanes) if kind == "mask" else vector, *args)
-
-    infer_global(function)(Template)
-
-    def lower(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        vector = vector_of(sig.args)
-        assert vector is not None
-        values = [
-            widen(builder, value, arg, vector) for value, arg in zip(args, sig.args, strict=True)
-        ]
-        return emit(builder, vector, *values)
-
-    for left, right in ((Vector, Vector), (Vector, types.Float), (types.Float, Vector)):
-        lower_builtin(function, left, right)(lower)
-
-
-def _arithmetic(name: str) -> Callable[..., ir.Value]:
-    def emit(builder: ir.IRBuilder, vector: Vector, a: ir.Value, b: ir.Value) -> ir.Value:
-        flags = ("contract",) if vector.element == types.float64 else ()
-        return getattr(builder, name)(a, b, flags=flags)
-
-    return emit
-
-
-def _comparison(sign: str) -> Callable[..., ir.Value]:
-    def emit(builder: ir.IRBuilder, vector: Vector, a: ir.Value, b: ir.Value) -> ir.Value:
-        return builder.fcmp_ordered(sign, a, b)
-
-    return emit
-
-
-for _function, _name in (
-    (operator.add, "fadd"),
-    (operator.sub, "fsub"),
-    (operator.mul, "fmul"),
-    (operator.truediv, "fdiv"),
-):
-    _define_operator(_function, _arithmetic(_name), "vector")
-for _function, _name in (
-    (operator.lt, "<"),
-    (operator.le, "<="),
-    (operator.gt, ">"),
-    (operator.ge, ">="),
-):
-    _define_operator(_function, _comparison(_name), "mask")
-
-
-def _define_mask_operator(function: Callable[..., Any], name: str) -> None:
-    class Template(AbstractTemplate):
-        metadata = _FIRST
-
-        def generic(self, args: tuple[types.Type, ...], kws: dict[str, types.Type]) -> Any:
-            if len(args) == 2 and isinstance(args[0], Mask) and args[0] == args[1]:
-                return signature(args[0], *args)
-            return None
-
-    infer_global(function)(Template)
-
-    @lower_builtin(function, Mask, Mask)
-    def lower(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        return getattr(builder, name)(*args)
-
-
-_define_mask_operator(operator.and_, "and_")
-_define_mask_operator(operator.or_, "or_")
-
-
-_I32 = ir.IntType(32)
-
-
-def _pointer(context: Any, builder: ir.IRBuilder, kind: Any, array: Any, index: Any) -> ir.Value:
-    """Address of a C-contiguous array's element, by flat index."""
-    data = context.make_array(kind)(context, builder, array).data
-    return builder.gep(data, [index])
-
-
-def _as_vector_pointer(builder: ir.IRBuilder, pointer: ir.Value, vector: ir.Type) -> ir.Value:
-    return builder.bitcast(pointer, ir.PointerType(vector))
-
-
-def make_constant(vector: Vector, values: Sequence[float]) -> Callable[[], Any]:
-    """An intrinsic that returns a vector known at compile time."""
-    held = tuple(float(value) for value in values)
-
-    @intrinsic
-    def constant(typingctx: Any) -> Any:
-        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
-            return ir.Constant(vector.llvm, list(held))
-
-        return vector(), codegen
-
-    return constant
-
-
-def make_fill(vector: Vector) -> Callable[[Any], Any]:
-    """An intrinsic that puts one number into every lane."""
-
-    @intrinsic
-    def fill(typingctx: Any, value: Any) -> Any:
-        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
-            return splat(builder, args[0], vector.lanes)
-
-        return vector(vector.element), codegen
-
-    return fill
-
-
-def make_load(vector: Vector) -> Callable[[Any, Any], Any]:
-    """An intrinsic that reads consecutive elements, `load(array, flat_index)`."""
-
-    @intrinsic
-    def load(typingctx: Any, array: Any, index: Any) -> Any:
-        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
-            pointer = _pointer(context, builder, sig.args[0], *args)
-            return builder.load(_as_vector_pointer(builder, pointer, vector.llvm), align=4)
-
-        return vector(array, types.intp), codegen
-
-    return load
-
-
-@intrinsic
-def store(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
-    """Writes a vector over consecutive elements: `store(array, flat_index, vector)`."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
-        pointer = _pointer(context, builder, sig.args[0], args[0], args[1])
-        builder.store(args[2], _as_vector_pointer(builder, pointer, args[2].type), align=4)
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, value), codegen
-
-
-@intrinsic
-def fma(typingctx: Any, a: Any, b: Any, c: Any) -> Any:
-    """a * b + c with one rounding, in every lane; scalars are spread."""
-    vector = vector_of((a, b, c))
-    if vector is None:
-        return None
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
-        values = [
-            widen(builder, value, kind, vector) for value, kind in zip(args, sig.args, strict=True)
-        ]
-        return call(builder, "fma", vector, values)
-
-    return vector(a, b, c), codegen
+def widen(
+    builder: ir.IRBuilder, vector: Vector, values: Iterable[ir.Value], kinds: Iterable[types.Type]
+) -> list[ir.Value]:
+    """Vectors from values that are vectors already or scalars."""
+    return [
+        value if isinstance(kind, Vector) else splat(builder, value, vector.lanes)
+        for value, kind in zip(values, kinds, strict=True)
+    ]
 
 
 def call(builder: ir.IRBuilder, name: str, vector: Vector, values: Sequence[Any]) -> ir.Value:
     """Emits a call of an LLVM intrinsic, such as `fma`, on whole vectors."""
     kind = ir.FunctionType(vector.llvm, [vector.llvm] * len(values))
     suffix = "f32" if vector.element == types.float32 else "f64"
-    function = cgutils.get_or_insert_function(
-        builder.module, kind, f"llvm.{name}.v{vector.lanes}{suffix}"
+    full = f"llvm.{name}.v{vector.lanes}{suffix}"
+    return builder.call(cgutils.get_or_insert_function(builder.module, kind, full), values)
+
+
+def _teach(
+    function: Callable[..., Any],
+    pairs: Iterable[tuple[type, type]],
+    result: Callable[..., types.Type | None],
+    emit: Callable[..., ir.Value],
+) -> None:
+    """Teaches numba an operator for pairs of kinds of operands."""
+
+    class Template(AbstractTemplate):
+        metadata = _FIRST
+
+        def generic(self, args: tuple[types.Type, ...], kws: dict[str, types.Type]) -> Any:
+            kind = None if kws or len(args) != 2 else result(*args)
+            return None if kind is None else signature(kind, *args)
+
+    infer_global(function)(Template)
+
+    def lower(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+        vector = vector_of(sig.args)
+        if vector is None:
+            return emit(builder, *args)
+        # Only the projection is in float64, and only it may contract.
+        flags = ("contract",) if vector.element == types.float64 else ()
+        return emit(builder, *widen(builder, vector, args, sig.args), flags=flags)
+
+    for left, right in pairs:
+        lower_builtin(function, left, right)(lower)
+
+
+_NUMBERS = ((Vector, Vector), (Vector, types.Float), (types.Float, Vector))
+
+
+def _mask_of(*args: types.Type) -> Mask | None:
+    vector = vector_of(args)
+    return None if vector is None else Mask(vector.lanes)
+
+
+def _compare(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, sign: str, flags: Any) -> ir.Value:
+    return builder.fcmp_ordered(sign, a, b)
+
+
+for _name, _emit in (
+    ("add", ir.IRBuilder.fadd),
+    ("sub", ir.IRBuilder.fsub),
+    ("mul", ir.IRBuilder.fmul),
+    ("truediv", ir.IRBuilder.fdiv),
+):
+    _teach(getattr(operator, _name), _NUMBERS, lambda *args: vector_of(args), _emit)
+for _name, _sign in (("lt", "<"), ("le", "<="), ("gt", ">"), ("ge", ">=")):
+    _teach(getattr(operator, _name), _NUMBERS, _mask_of, functools.partial(_compare, sign=_sign))
+for _name, _emit in (("and_", ir.IRBuilder.and_), ("or_", ir.IRBuilder.or_)):
+    _teach(
+        getattr(operator, _name),
+        [(Mask, Mask)],
+        lambda a, b: a if isinstance(a, Mask) and a == b else None,
+        _emit,
     )
-    return builder.call(function, values)
 
 
-def make_unary(name: str) -> Callable[[Any], Any]:
+class Call(NamedTuple):
+    """A call of an intrinsic that is being lowered."""
+
+    context: Any
+    builder: ir.IRBuilder
+    sig: Any
+
+    def place(self, array: Any, index: Any, vector: ir.Type | None = None) -> ir.Value:
+        """Address of an element of the first argument, by flat index; as that of a vector."""
+        data = self.context.make_array(self.sig.args[0])(self.context, self.builder, array).data
+        pointer = self.builder.gep(data, [index])
+        return pointer if vector is None else self.builder.bitcast(pointer, vector.as_pointer())
+
+    def load(self, array: Any, index: Any, vector: ir.Type) -> ir.Value:
+        """A vector of consecutive elements."""
+        return self.builder.load(self.place(array, index, vector), align=4)
+
+    def store(self, array: Any, index: Any, value: ir.Value) -> None:
+        """Write a vector over consecutive elements."""
+        self.builder.store(value, self.place(array, index, value.type), align=4)
+
+    def unpack(self, values: ir.Value) -> list[ir.Value]:
+        """The values of a tuple."""
+        return cgutils.unpack_tuple(self.builder, values)
+
+    def pack(self, values: Sequence[ir.Value]) -> ir.Value:
+        """The tuple that is returned."""
+        return self.context.make_tuple(self.builder, self.sig.return_type, values)
+
+
+def lowered(result: Callable[..., Any]) -> Callable[[Callable[..., Any]], Any]:
+    """Decorator: an intrinsic, whose function emits the code from a `Call` and the values.
+
+    Args:
+        result: from the types of the arguments, that of the value, or a signature, or None where
+            they do not fit. Where only the type is given, integers are taken as indices.
+    """
+
+    def define(emit: Callable[..., Any]) -> Any:
+        @functools.wraps(emit)
+        def typed(typingctx: Any, *args: Any) -> Any:
+            sig = result(*args)
+            if sig is None:
+                return None
+            if not isinstance(sig, Signature):
+                sig = sig(*(types.intp if isinstance(a, types.Integer) else a for a in args))
+
+            def codegen(context: Any, builder: Any, sig: Any, values: Any) -> ir.Value:
+                made = emit(Call(context, builder, sig), *values)
+                return context.get_dummy_value() if made is None else made
+
+            return sig, codegen
+
+        return intrinsic(typed)
+
+    return define
+
+
+def _nothing(*args: types.Type) -> types.Type:
+    return types.void
+
+
+def make_constant(vector: Vector, values: Iterable[float]) -> Any:
+    """An intrinsic that returns a vector known at compile time."""
+    held = [float(value) for value in values]
+
+    @lowered(lambda: vector)
+    def constant(code: Call) -> ir.Value:
+        return ir.Constant(vector.llvm, held)
+
+    return constant
+
+
+def make_fill(vector: Vector) -> Any:
+    """An intrinsic that puts one number into every lane."""
+
+    @lowered(lambda value: vector(vector.element))
+    def fill(code: Call, value: Any) -> ir.Value:
+        return splat(code.builder, value, vector.lanes)
+
+    return fill
+
+
+def make_load(vector: Vector) -> Any:
+    """An intrinsic that reads consecutive elements, `load(array, flat_index)`."""
+
+    @lowered(lambda array, index: vector)
+    def load(code: Call, array: Any, index: Any) -> ir.Value:
+        return code.load(array, index, vector.llvm)
+
+    return load
+
+
+@lowered(_nothing)
+def store(code: Call, array: Any, index: Any, value: Any) -> None:
+    """Writes a vector over consecutive elements: `store(array, flat_index, vector)`."""
+    code.store(array, index, value)
+
+
+@lowered(lambda a, b, c: vector_of((a, b, c)))
+def fma(code: Call, a: Any, b: Any, c: Any) -> ir.Value:
+    """a * b + c with one rounding, in every lane; scalars are spread."""
+    vector = code.sig.return_type
+    return call(code.builder, "fma", vector, widen(code.builder, vector, (a, b, c), code.sig.args))
+
+
+def _make_unary(name: str) -> Any:
     """An intrinsic that applies an LLVM intrinsic of one argument in every lane."""
 
-    @intrinsic
-    def unary(typingctx: Any, a: Any) -> Any:
-        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
-            return call(builder, name, sig.args[0], args)
-
-        return a(a), codegen
+    @lowered(lambda a: a)
+    def unary(code: Call, a: Any) -> ir.Value:
+        return call(code.builder, name, code.sig.return_type, [a])
 
     return unary
 
 
 #: NaN below zero.
-square_root = make_unary("sqrt")
-absolute = make_unary("fabs")
-floor = make_unary("floor")
-ceil = make_unary("ceil")
+square_root = _make_unary("sqrt")
+absolute = _make_unary("fabs")
+floor = _make_unary("floor")
+ceil = _make_unary("ceil")
 
 
-@intrinsic
-def select(typingctx: Any, mask: Any, a: Any, b: Any) -> Any:
+@lowered(
+    lambda mask, a, b: (
+        vector_of((a, b)) if isinstance(mask, Mask) and _mask_of(a, b) == mask else None
+    )
+)
+def select(code: Call, mask: Any, a: Any, b: Any) -> ir.Value:
     """`a` in the lanes where the mask holds, `b` in the others; scalars are spread."""
-    vector = vector_of((a, b))
-    if not isinstance(mask, Mask) or vector is None or vector.lanes != mask.lanes:
-        return None
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
-        yes = widen(builder, args[1], sig.args[1], vector)
-        no = widen(builder, args[2], sig.args[2], vector)
-        return builder.select(args[0], yes, no)
-
-    return vector(mask, a, b), codegen
+    yes, no = widen(code.builder, code.sig.return_type, (a, b), code.sig.args[1:])
+    return code.builder.select(mask, yes, no)
 
 
-@intrinsic
-def negate(typingctx: Any, a: Any) -> Any:
+@lowered(lambda mask, values: values)
+def keep(code: Call, mask: Any, values: Any) -> ir.Value:
+    """A tuple of vectors where the mask holds, else zeros, even where it is NaN."""
+    zero = code.sig.return_type.dtype.constant(0.0)
+    return code.pack([code.builder.select(mask, value, zero) for value in code.unpack(values)])
+
+
+@lowered(lambda a: a)
+def negate(code: Call, a: Any) -> ir.Value:
     """The sign turned in every lane."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
-        return builder.fneg(args[0])
-
-    return a(a), codegen
+    return code.builder.fneg(a)
 
 
-@intrinsic
-def bits(typingctx: Any, mask: Any) -> Any:
+@lowered(lambda mask: types.uint64 if isinstance(mask, Mask) else None)
+def bits(code: Call, mask: Any) -> ir.Value:
     """The mask as an integer, lane 0 in the lowest bit."""
-    if not isinstance(mask, Mask):
-        return None
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
-        number = builder.bitcast(args[0], ir.IntType(mask.lanes))
-        return builder.zext(number, ir.IntType(64))
-
-    return types.uint64(mask), codegen
+    number = code.builder.bitcast(mask, ir.IntType(code.sig.args[0].lanes))
+    return code.builder.zext(number, _I64)
 
 
-@intrinsic
-def lowest_bit(typingctx: Any, number: Any) -> Any:
+@lowered(lambda number: types.intp(types.uint64))
+def lowest_bit(code: Call, number: Any) -> ir.Value:
     """Index of the lowest set bit of a number that is not zero."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
-        return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
-
-    return types.intp(types.uint64), codegen
+    return code.builder.cttz(number, ir.Constant(ir.IntType(1), 1))
 
 
-@intrinsic
-def count_bits(typingctx: Any, number: Any) -> Any:
+@lowered(lambda number: types.intp(types.uint64))
+def count_bits(code: Call, number: Any) -> ir.Value:
     """How many bits of a number are set."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
-        return builder.ctpop(args[0])
-
-    return types.intp(types.uint64), codegen
+    return code.builder.ctpop(number)
 
 
-@intrinsic
-def add_exponent(typingctx: Any, value: Any, shifted: Any) -> Any:
+@lowered(lambda value, shifted: value)
+def add_exponent(code: Call, value: Any, shifted: Any) -> ir.Value:
     """value * 2**n, where n sits in the low bits of `shifted` = n + 1.5 * 2**23 (float32)."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
-        whole = ir.VectorType(_I32, value.lanes)
-        by = ir.Constant(whole, [23] * value.lanes)
-        power = builder.shl(builder.bitcast(args[1], whole), by)
-        return builder.bitcast(builder.add(builder.bitcast(args[0], whole), power), value.llvm)
-
-    return value(value, value), codegen
+    builder, whole = code.builder, ir.VectorType(_I32, value.type.count)
+    by = ir.Constant(whole, [23] * value.type.count)
+    power = builder.shl(builder.bitcast(shifted, whole), by)
+    return builder.bitcast(builder.add(builder.bitcast(value, whole), power), value.type)
 
 
-@intrinsic
-def split_exponent(typingctx: Any, value: Any) -> Any:
+@lowered(lambda value: types.UniTuple(value, 2))
+def split_exponent(code: Call, value: Any) -> ir.Value:
     """(m, n) with value = m * 2**n and m in [0.75, 1.5), for normal positive float64."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
-        lanes = value.lanes
-        whole = ir.VectorType(ir.IntType(64), lanes)
-
-        def const(number: int) -> ir.Constant:
-            return ir.Constant(whole, [number] * lanes)
-
-        number = builder.bitcast(args[0], whole)
-        start = const(0x3FE8000000000000)  # 0.75
-        exponent = builder.ashr(builder.sub(number, start), const(52))
-        mantissa = builder.sub(number, builder.shl(exponent, const(52)))
-        return context.make_tuple(
-            builder,
-            sig.return_type,
-            (
-                builder.bitcast(mantissa, value.llvm),
-                builder.sitofp(exponent, value.llvm),
-            ),
-        )
-
-    return types.UniTuple(value, 2)(value), codegen
+    builder, lanes = code.builder, value.type.count
+    whole = ir.VectorType(_I64, lanes)
+    start, shift = (ir.Constant(whole, [n] * lanes) for n in (0x3FE8000000000000, 52))  # 0.75
+    number = builder.bitcast(value, whole)
+    exponent = builder.ashr(builder.sub(number, start), shift)
+    mantissa = builder.sub(number, builder.shl(exponent, shift))
+    return code.pack([builder.bitcast(mantissa, value.type), builder.sitofp(exponent, value.type)])
 
 
-@intrinsic
-def atomic_add_one(typingctx: Any, array: Any, index: Any) -> Any:
+@lowered(lambda array, index: types.int64)
+def atomic_add_one(code: Call, array: Any, index: Any) -> ir.Value:
     """Adds one to an element of an int64 array that threads share, and returns the value before."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
-        pointer = _pointer(context, builder, sig.args[0], *args)
-        return builder.atomic_rmw("add", pointer, ir.Constant(ir.IntType(64), 1), "monotonic")
-
-    return types.int64(array, types.intp), codegen
+    place = code.place(array, index)
+    return code.builder.atomic_rmw("add", place, ir.Constant(_I64, 1), "monotonic")
 
 
-@intrinsic
-def prefetch(typingctx: Any, array: Any, index: Any) -> Any:
+@lowered(_nothing)
+def prefetch(code: Call, array: Any, index: Any) -> None:
     """Asks for the cache line of an element before it is needed."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
-        byte = ir.IntType(8).as_pointer()
-        function = builder.module.declare_intrinsic(
-            "llvm.prefetch", [byte], ir.FunctionType(ir.VoidType(), [byte, _I32, _I32, _I32])
-        )
-        pointer = _pointer(context, builder, sig.args[0], *args)
-        to_read, keep, data = (ir.Constant(_I32, value) for value in (0, 3, 1))
-        builder.call(function, [builder.bitcast(pointer, byte), to_read, keep, data])
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp), codegen
+    byte = ir.IntType(8).as_pointer()
+    function = code.builder.module.declare_intrinsic(
+        "llvm.prefetch", [byte], ir.FunctionType(ir.VoidType(), [byte, _I32, _I32, _I32])
+    )
+    pointer = code.builder.bitcast(code.place(array, index), byte)
+    to_read, held, data = (ir.Constant(_I32, value) for value in (0, 3, 1))
+    code.builder.call(function, [pointer, to_read, held, data])
 
 
-@intrinsic
-def narrow(typingctx: Any, a: Any) -> Any:
+@lowered(lambda a: Vector(types.float32, a.lanes))
+def narrow(code: Call, a: Any) -> ir.Value:
     """float64 lanes rounded to float32."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
-        return builder.fptrunc(args[0], sig.return_type.llvm)
-
-    return Vector(types.float32, a.lanes)(a), codegen
+    return code.builder.fptrunc(a, code.sig.return_type.llvm)
 
 
-@intrinsic
-def store_sums(typingctx: Any, array: Any, index: Any, vectors: Any) -> Any:
+@lowered(
+    lambda array, index, vectors: (
+        types.void
+        if isinstance(vectors, types.UniTuple) and isinstance(vectors.dtype, Vector)
+        else None
+    )
+)
+def store_sums(code: Call, array: Any, index: Any, vectors: Any) -> None:
     """Writes the sum over the lanes of each vector of a tuple to consecutive elements.
 
     As many elements are written as fill whole vectors; those beyond the tuple hold nothing of
     meaning. Halves are added pair by pair, so k vectors cost about 2 k shuffles rather than
     k log2(lanes), and the order of the sums is fixed.
     """
-    if not isinstance(vectors, types.UniTuple) or not isinstance(vectors.dtype, Vector):
-        return None
-    lanes = vectors.dtype.lanes
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
-        rows = cgutils.unpack_tuple(builder, args[2], vectors.count)
-        for first in range(0, len(rows), lanes):
-            sums = _sum_rows(builder, rows[first : first + lanes], lanes)
-            at = builder.add(args[1], ir.Constant(args[1].type, first))
-            pointer = _pointer(context, builder, sig.args[0], args[0], at)
-            builder.store(sums, _as_vector_pointer(builder, pointer, sums.type), align=4)
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, vectors), codegen
+    rows, lanes = code.unpack(vectors), code.sig.args[2].dtype.lanes
+    for first in range(0, len(rows), lanes):
+        sums = _sum_rows(code.builder, rows[first : first + lanes], lanes)
+        code.store(array, code.builder.add(index, ir.Constant(index.type, first)), sums)
 
 
 def _sum_rows(builder: ir.IRBuilder, rows: list[Any], lanes: int) -> ir.Value:
@@ -457,11 +403,11 @@ def _sum_rows(builder: ir.IRBuilder, rows: list[Any], lanes: int) -> ir.Value:
     width = lanes  # lanes over which one row's sum is still spread
     while width > 1:
         half = width // 2
-        low: list[int] = []
-        high: list[int] = []
-        for first in range(0, 2 * lanes, width):
-            low += range(first, first + half)
-            high += range(first + half, first + width)
+        starts = range(0, 2 * lanes, width)
+        low, high = (
+            [lane for start in starts for lane in range(start + skip, start + skip + half)]
+            for skip in (0, half)
+        )
         pairs = [(rows[k], rows[min(k + 1, len(rows) - 1)]) for k in range(0, len(rows), 2)]
         rows = [
             builder.fadd(shuffle(builder, a, b, low), shuffle(builder, a, b, high))

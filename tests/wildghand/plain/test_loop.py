@@ -9,7 +9,8 @@ import torch
 from painted import painted_avatar
 
 from hwp_bench.base.errors import DidNotConverge
-from wildghand.gaussians.fit_loop import MAX_RISE, WINDOW, Guard, repeatable
+from wildghand.gaussians.fit_loop import repeatable
+from wildghand.plain.loop import MAX_RISE, WINDOW, Watchers
 from wildghand.plain.model import PlainModel
 
 
@@ -18,18 +19,18 @@ def model() -> PlainModel:
     return painted_avatar(("right",)).model
 
 
-def watch_window(guard: Guard, model: PlainModel, start: int, loss: float) -> list[bool]:
+def watch_window(guard: Watchers, model: PlainModel, start: int, loss: float) -> list[bool]:
     return [guard.watch(start + i, loss, model) for i in range(WINDOW)]
 
 
 def test_falling_loss_is_fine_and_the_last_window_is_kept(model: PlainModel) -> None:
-    guard = Guard()
+    guard = Watchers()
     assert all(watch_window(guard, model, 0, 1.0) + watch_window(guard, model, WINDOW, 0.5))
     assert guard.step == 2 * WINDOW - 1
 
 
 def test_a_loss_that_rises_far_is_divergence_and_the_best_state_is_kept(model: PlainModel) -> None:
-    guard = Guard()
+    guard = Watchers()
     watch_window(guard, model, 0, 1.0)
     kept = model.light.clone()
     changed = model.with_parameters({**model.parameters(), "light": model.light + 1.0})
@@ -39,7 +40,7 @@ def test_a_loss_that_rises_far_is_divergence_and_the_best_state_is_kept(model: P
 
 
 def test_the_kept_state_is_a_copy(model: PlainModel) -> None:
-    guard = Guard()
+    guard = Watchers()
     live = model.snapshot()
     watch_window(guard, live, 0, 1.0)
     live.light.add_(5.0)
@@ -48,11 +49,11 @@ def test_the_kept_state_is_a_copy(model: PlainModel) -> None:
 
 @pytest.mark.parametrize("loss", [math.nan, math.inf])
 def test_a_loss_that_is_no_number_is_divergence(model: PlainModel, loss: float) -> None:
-    assert not Guard().watch(0, loss, model)
+    assert not Watchers().watch(0, loss, model)
 
 
 def test_a_parameter_that_is_no_number_is_divergence(model: PlainModel) -> None:
-    guard = Guard()
+    guard = Watchers()
     watch_window(guard, model, 0, 1.0)
     broken = model.snapshot()
     broken.gaussians.offsets[3, 1] = math.nan
@@ -72,7 +73,7 @@ def test_a_model_that_is_broken_since_the_last_window_is_not_sound(model: PlainM
 
 def test_without_any_good_state_there_is_only_the_error() -> None:
     with pytest.raises(DidNotConverge, match="first 50 steps"):
-        Guard().best()
+        Watchers().best()
 
 
 def test_gradients_of_large_reads_repeat_on_several_threads() -> None:
