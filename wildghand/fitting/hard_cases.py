@@ -226,7 +226,7 @@ def _run_constant(context: Context) -> Measured:
     made = module.released(residual, regions, _hand(), _hand(), residual[..., 0].detach())
     made.weights.sum().backward()
     passed = _finite(made.weights, residual.grad) and bool((made.errors == 0.0).all())
-    return Measured(passed, f"largest E {float(made.errors.max()):g}")
+    return Measured(passed, f"largest E {float(made.errors.detach().max()):g}")
 
 
 def _run_no_weight(context: Context) -> Measured:

@@ -188,10 +188,6 @@ class PaoSettings:
         check_source(self.hand, "hand", ("estimated", "graph-cut"), ("sam",))
 
 
-#: The equations as printed, with the paper's thresholds.
-PAPER_PAO = PaoSettings(variant="printed")
-
-
 @dataclass(frozen=True, eq=False)
 class Weights:
     """Weights of the pixels of B frames, and what they are made of."""

@@ -19,7 +19,7 @@ from wildghand.model.settings import (
 )
 from wildghand.model.terms import WEIGHTS, TermSettings
 from wildghand.network import network_settings
-from wildghand.pao.pao import PAPER_PAO, PerturbationAwareWeights
+from wildghand.pao.pao import PerturbationAwareWeights
 
 #: Every setting by its dotted name, with its default.
 EVERY = dict(flattened(dataclasses.asdict(WildGHandSettings())))
@@ -68,7 +68,7 @@ def test_stored_settings_are_read_as_they_were() -> None:
 
 @pytest.mark.parametrize(
     ("mode", "variant", "batch", "by_time"),
-    [("paper", PAPER_PAO.variant, 4, False), ("released", "released", 0, True)],
+    [("paper", "printed", 4, False), ("released", "released", 0, True)],
 )
 def test_the_published_modes_have_no_addition(
     mode: str, variant: str, batch: int, by_time: bool

@@ -14,14 +14,13 @@ from hwp_bench.base.errors import BadMethod, ShapeMismatch, UsageError
 from hwp_bench.methods.settings import settings_from
 from wildghand.pao.pao import (
     CONSTANTS,
-    PAPER_PAO,
     PaoSettings,
     PerturbationAwareWeights,
     binary_weights,
 )
 from wildghand.pao.regions import FrameRegions, Regions, overlapping, partition, stack_regions
 
-PRINTED = PAPER_PAO.variant
+PRINTED = "printed"
 SIZE = 12
 
 
