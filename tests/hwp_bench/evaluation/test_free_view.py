@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from small_captures import CaptureMaker
-from small_methods import SUBMISSION, write_manifest
+from small_methods import write_manifest, write_submission
 
 from hwp_bench.base.errors import BadCapture, BadInput
 from hwp_bench.base.images import read_rgb, write_image
@@ -54,13 +54,10 @@ def clip_of(capture: Capture) -> Capture:
 
 def submission(folder: Path, capture: Capture, views: range | tuple[int, ...]) -> Path:
     """The truth as an entry, with some frames of the clip."""
-    target = folder / "predictions" / capture.info.id
-    for frame in contiguous_split(capture.info.id, len(capture)).test.tolist():
-        write_image(target / f"{frame:06d}.png", capture.frame(frame))
-    for frame in views:
-        write_image(target / "free" / f"{frame:06d}.png", clip_of(capture).frame(frame))
-    write_manifest(folder, "entry", SUBMISSION)
-    return folder
+    frames = contiguous_split(capture.info.id, len(capture)).test.tolist()
+    images = {f"tiny/{frame:06d}.png": capture.frame(frame) for frame in frames}
+    images |= {f"tiny/free/{frame:06d}.png": clip_of(capture).frame(frame) for frame in views}
+    return write_submission(folder, images)
 
 
 def method(folder: Path, *, fit: str = "pass", render: str = "pass") -> Path:
