@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hwp_bench.base.errors import BadInput, MissingDependency, ShapeMismatch
-from hwp_bench.metrics.pixels import check_same_shape
+from hwp_bench.base.errors import BadInput, MissingDependency
 
 if TYPE_CHECKING:
     import torch
@@ -106,35 +105,24 @@ class Lpips:
         ]
 
     def __call__(self, prediction: np.ndarray, target: np.ndarray) -> float:
-        """LPIPS of two (H, W, 3) float images in [0, 1], sRGB; 0 for identical images."""
+        """LPIPS of two (H, W, 3) float images in [0, 1], sRGB; 0 for identical images.
+
+        Over the compared layers, the sum of the spatial means of the weighted squared differences
+        of unit feature vectors.
+        """
         import torch
 
-        check_same_shape(prediction, target)
         pair = torch.from_numpy(np.stack([prediction, target])).to(torch.float32)
         pair = pair.permute(0, 3, 1, 2) * 2.0 - 1.0
         with torch.inference_mode():
-            return float(self.distance(pair[:1], pair[1:])[0])
-
-    def distance(self, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
-        """LPIPS of image batches.
-
-        Args:
-            x: (B, 3, H, W) float in [-1, 1].
-
-        Returns:
-            (B,): over the compared layers, the sum of the spatial means of the weighted squared
-            differences of unit feature vectors.
-        """
-        if x.shape != y.shape or x.ndim != 4 or x.shape[1] != 3:
-            raise ShapeMismatch(f"LPIPS wants two (B, 3, H, W), not {x.shape} and {y.shape}")
-        if min(x.shape[2:]) < 32:
-            raise ShapeMismatch(f"images of {tuple(x.shape[2:])} are too small for LPIPS")
-        total = x.new_zeros(x.shape[0])
-        features = zip(self._features(x), self._features(y), self._linear, strict=True)
-        for a, b, weight in features:
-            squared = (_unit(a) - _unit(b)) ** 2
-            total = total + (squared * weight).sum(dim=1).mean(dim=(1, 2))
-        return total
+            total = pair.new_zeros(1)
+            features = zip(
+                self._features(pair[:1]), self._features(pair[1:]), self._linear, strict=True
+            )
+            for a, b, weight in features:
+                squared = (_unit(a) - _unit(b)) ** 2
+                total = total + (squared * weight).sum(dim=1).mean(dim=(1, 2))
+            return float(total[0])
 
     def _features(self, image: torch.Tensor) -> list[torch.Tensor]:
         """The compared feature maps of (B, 3, H, W) in [-1, 1]."""

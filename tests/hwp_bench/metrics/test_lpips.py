@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hwp_bench.base.errors import BadInput, MissingDependency, ShapeMismatch
+from hwp_bench.base.errors import BadInput, MissingDependency
 from hwp_bench.metrics import lpips as lpips_weights
 from hwp_bench.metrics.lpips import (
     BACKBONE_FILES,
@@ -124,23 +124,9 @@ def test_matches_torchmetrics(net, images, monkeypatch):
     assert Lpips(net, backbone, linear)(*images) == pytest.approx(expected, rel=1e-5)
 
 
-def test_identical_images_score_zero_and_batches_equal_single_images(images):
+def test_identical_images_score_zero(images):
     _, backbone, linear = random_network("alex")
-    lpips = Lpips("alex", backbone, linear)
-    x, y = images
-    assert lpips(x, x) == 0.0
-    batch = torch.from_numpy(np.stack([x, y])).permute(0, 3, 1, 2).float() * 2 - 1
-    together = lpips.distance(batch, batch.flip(0))
-    assert together.tolist() == pytest.approx([lpips(x, y), lpips(y, x)], rel=1e-5)
-
-
-def test_gradients_reach_the_image(images):
-    _, backbone, linear = random_network("alex")
-    x, y = (torch.from_numpy(i.transpose(2, 0, 1)[None]).float() * 2 - 1 for i in images)
-    x.requires_grad_()
-    Lpips("alex", backbone, linear).distance(x, y).sum().backward()
-    assert torch.isfinite(x.grad).all()
-    assert x.grad.abs().max() > 0
+    assert Lpips("alex", backbone, linear)(images[0], images[0]) == 0.0
 
 
 def broken(state: dict, name: str, value) -> dict:
@@ -172,15 +158,6 @@ def test_a_wrong_checkpoint_is_refused_by_the_name_of_the_weight(part, name, val
     states[part] = broken(states[part], name, value)
     with pytest.raises(BadInput, match=message):
         Lpips("alex", states["backbone"], states["linear"])
-
-
-def test_images_that_do_not_fit_are_refused(images):
-    _, backbone, linear = random_network("alex")
-    lpips = Lpips("alex", backbone, linear)
-    with pytest.raises(ShapeMismatch):
-        lpips(images[0], images[1][1:])
-    with pytest.raises(ShapeMismatch, match="too small"):
-        lpips(images[0][:31], images[1][:31])
 
 
 @pytest.fixture
