@@ -271,7 +271,7 @@ class Aggregate:
 
 
 def aggregate(captures: Iterable[CaptureScores]) -> Aggregate:
-    """Average frame scores; nothing is dropped, and NaN and infinity are refused.
+    """Average frame scores; nothing is dropped.
 
     Sums are exact before they are rounded once (`math.fsum`), so the order of captures and frames
     never changes a digit.
@@ -332,7 +332,3 @@ def _check(captures: Sequence[CaptureScores]) -> None:
                 odd = ", ".join(sorted(set(row) ^ metrics)) or "none at all"
                 problem = f"its metrics differ from the other frames' ({odd})"
                 raise BadResult(problem, where=capture.id, field=place)
-            for name, score in row.items():
-                if not math.isfinite(score):
-                    problem = f"the score is {score}"
-                    raise BadResult(problem, where=capture.id, field=f"{place}.{name}")
