@@ -33,8 +33,8 @@ EPSILON = 1e-10
 class Convolution(NamedTuple):
     """One convolution with its ReLU, as the torchvision checkpoint numbers it."""
 
-    #: Place in `features`: its weights are `features.{index}.weight` and `.bias`.
-    index: int
+    #: Number in `features`: its weights are `features.{number}.weight` and `.bias`.
+    number: int
     stride: int
     padding: int
     #: (kernel, stride) of the max pooling before it, if there is one.
@@ -74,7 +74,7 @@ class Lpips:
         linear: Mapping[str, torch.Tensor],
     ) -> None:
         self._layers = BACKBONES[net]
-        names = [f"features.{layer.index}" for layer in self._layers]
+        names = [f"features.{layer.number}" for layer in self._layers]
         self._weights = [
             (backbone[f"{name}.weight"].float(), backbone[f"{name}.bias"].float()) for name in names
         ]
