@@ -149,16 +149,11 @@ def verify_results(
     found += copy_differences(file.parent, stored, RESULT)
     notes = _notes(results, scorer.networks)
     own = results.environment.get("code") == code_digest()
-    found += digest_differences(stored, expected=own)
+    found += digest_differences(stored)
     if own:
         found += _table_differences(file.parent, results)
-    else:
-        if (file.parent / "tables").is_dir():
-            notes.append("The tables next to it were not compared: other code made them.")
-        if stored.get("digest") is None:
-            notes.append(
-                "It states no digest of its content: times and curves are as the file says."
-            )
+    elif (file.parent / "tables").is_dir():
+        notes.append("The tables next to it were not compared: other code made them.")
     return Verification(
         str(file), scored, scorer.frames, tuple(found), tuple(notes), scorer.cross_checked
     )
@@ -374,12 +369,10 @@ def _psnr(x: np.ndarray, y: np.ndarray, cap: float) -> float:
 # --- what no pixel decides
 
 
-def digest_differences(value: Mapping[str, Any], *, expected: bool) -> list[Discrepancy]:
+def digest_differences(value: Mapping[str, Any]) -> list[Discrepancy]:
     """Compare a result file with the digest that it states of its own content."""
     stated, found = content_digest(value)
-    if stated == found or (stated is None and not expected):
-        return []
-    return [Discrepancy("", "digest", _brief(stated), found)]
+    return [] if stated == found else [Discrepancy("", "digest", _brief(stated), found)]
 
 
 def copy_differences(root: Path, value: Mapping[str, Any], name: str) -> list[Discrepancy]:
