@@ -115,7 +115,10 @@ class _Run:
         # On the node that orders the jobs, where the folders are, and so that no lost node takes
         # the board along.
         here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=True)
-        board = ray.remote(Board).options(num_cpus=0, scheduling_strategy=here)
+        # Where Ray puts it on another node after all, it begins again: jobs cannot do without it.
+        board = ray.remote(Board).options(
+            num_cpus=0, scheduling_strategy=here, max_restarts=-1, max_task_retries=-1
+        )
         self._board = board.remote(
             {
                 digest: replace(folder, path=folder.path.absolute())
