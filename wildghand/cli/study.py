@@ -139,17 +139,21 @@ def do_explain(args: argparse.Namespace) -> int:
     """Run the command."""
     from hwp_bench.base.images import write_image
     from hwp_bench.capture import open_capture
-    from wildghand.avatar.render import explain_frames, explanation_sheet
+    from wildghand.avatar.render import explain_frames, explanation_sheet, temporal_weights
 
     check_places({"--out": args.out}, {"AVATAR": args.avatar, "CAPTURE": args.capture})
     capture = open_capture(args.capture)
-    found = explain_frames(avatar_of(args), capture, args.frames)
+    avatar = avatar_of(args)
+    found = explain_frames(avatar, capture, args.frames)
     names = {}
     for item in found:
         acting = [kind for kind, level in capture.info.severity(item.frame).items() if level]
         names[item.frame] = ", ".join(kind.replace("_", " ") for kind in acting)
     write_image(args.out, explanation_sheet(found, names))
     print(f"{args.out}: {len(found)} frames")
+    for side, (size, rank) in temporal_weights(avatar, capture).items():
+        told = "not known" if rank is None else f"{rank:.2f}"
+        print(f"{side} hand: mean |omega| {size:.2g}, rank correlation with severity {told}")
     return 0
 
 
