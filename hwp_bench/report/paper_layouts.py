@@ -76,6 +76,7 @@ def fact_table(number: int) -> Table:
     names = [perturbation(name).title for name in PERTURBATIONS]
     keys = ("clean_test", "single", "interacting", *PERTURBATIONS)
     heads = ["Data set", "Environment", "Clean test", "Single", "Interacting", *names]
+    notes: tuple[str, ...]
     caption, notes = "Hand video data sets", (f"Published in {published.title}, table 1.",)
     rows = [
         (item.name, item.environment, *_ticks(key in item.has for key in keys))

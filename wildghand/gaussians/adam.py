@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import Any
 
@@ -45,24 +46,24 @@ class ClippedAdam(torch.optim.Adam):
                 parameter.grad = None
 
     def take_step(self, loss: Tensor) -> None:
-        """Move everything that has a gradient; nothing changes where one or the loss is not finite.
+        """Move everything that has a gradient.
 
-        Nobody waits to learn whether it is: torch's fused kernels read that where it lies, as for a
-        `GradScaler`, and skip the step.
+        Nothing changes where the loss or a gradient is not finite. Nobody waits to learn whether
+        they are: torch's fused kernels read that where it lies, as for a `GradScaler`, and skip the
+        step.
         """
-        clipped, others, seen = [], [], loss.detach()
+        gradients = []
         for group in self.param_groups:
             for parameter in group["params"]:
                 _lay_out_alike(parameter)
-                if self.limit > 0.0 and group.get("clipped", True):
-                    clipped.append(parameter)
-                elif parameter.grad is not None:
-                    others.append(parameter.grad)
-        if clipped:
-            seen = seen + torch.nn.utils.clip_grad_norm_(clipped, self.limit)
-        if others:
-            seen = seen + torch.stack(torch._foreach_norm(others)).sum()
-        self.found_inf = (~seen.isfinite()).float()
+                if parameter.grad is not None:
+                    gradients.append(parameter.grad)
+        sizes = torch.stack(torch._foreach_norm(gradients, math.inf))
+        finite = loss.detach().isfinite() & sizes.isfinite().all()
+        if self.limit > 0.0:
+            clipped = [group["params"] for group in self.param_groups if group.get("clipped", True)]
+            torch.nn.utils.clip_grad_norm_([p for some in clipped for p in some], self.limit)
+        self.found_inf = (~finite).float()
         self.step()
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
