@@ -71,18 +71,12 @@ def check(path: Path, frames: int, size: int) -> None:
 
 def score(path: Path, frames: int, size: int) -> None:
     """Every frame against itself in the metrics without weights, read as it is scored."""
-    from functools import partial
-
-    from hwp_bench.metrics.score import Frame, score_frames
+    from hwp_bench.metrics.score import score_frame
 
     capture = open_capture(path)
-
-    def read(frame: int) -> Frame:
+    for frame in range(frames):
         image = capture.frame(frame)
-        return Frame(image, image, capture.mask(frame))
-
-    for _ in score_frames([partial(read, frame) for frame in range(frames)], workers=1):
-        pass
+        score_frame(image, image, capture.mask(frame))
 
 
 def pose(path: Path, frames: int, size: int) -> None:

@@ -102,7 +102,7 @@ def score(
     prediction: np.ndarray, target: np.ndarray, networks: Mapping[str, Network] | None = None
 ) -> dict[str, float]:
     """The protocol's scores of a degraded photograph."""
-    return score_frame(prediction, target, disc(), (HWP_V1,), networks=networks)
+    return score_frame(prediction, target, disc(), networks=networks)
 
 
 def at_equal_psnr(kind: Kind, target: np.ndarray) -> tuple[float, np.ndarray]:

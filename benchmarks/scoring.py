@@ -54,8 +54,7 @@ def cycle(frames: list[Frame], count: int) -> Iterator[Frame]:
 
 
 def run_ours(frames: list[Frame], count: int, workers: int) -> None:
-    for _ in score_frames(cycle(frames, count), workers=workers):
-        pass
+    score_frames(cycle(frames, count), workers=workers)
 
 
 def run_scikit_image(frames: list[Frame], count: int) -> None:

@@ -36,13 +36,13 @@ def states() -> dict[str, bool]:
     thread.join()
     before = torch.get_num_threads()
     torch.set_num_threads(2)
-    least = torch.full((400_000,), LEAST, dtype=torch.float64)
-    weight = torch.full((400_000,), 0.5, dtype=torch.float64, requires_grad=True)
+    least = torch.full((100_000,), LEAST, dtype=torch.float64)
+    weight = torch.full((100_000,), 0.5, dtype=torch.float64, requires_grad=True)
     products = least * 0.5
     (weight * least).sum().backward(torch.tensor(0.5, dtype=torch.float64))
     torch.set_num_threads(before)
     assert weight.grad is not None
-    left, right = np.full((300, 300), LEAST), np.full((300, 300), 0.5 / 300)
+    left, right = np.full((128, 128), LEAST), np.full((128, 128), 0.5 / 128)
     return {
         "this": flushes(),
         "started": started[0],

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from small_methods import SCRIPT, write_manifest
+
 
 def folder_of(path: Path) -> Path:
     """Make a folder."""
@@ -15,8 +17,5 @@ def hostile_method(folder: Path, script: str) -> Path:
     """Write a method directory whose program is the script."""
     folder_of(folder)
     (folder / "run.py").write_text("import json, os, pathlib, subprocess, sys, time\n" + script)
-    (folder / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "hostile"\n[entry]\n'
-        'command = ["{python}", "{method}/run.py", "{request}", "{output}"]\n'
-    )
+    write_manifest(folder, "hostile", SCRIPT)
     return folder

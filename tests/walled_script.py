@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from small_methods import SCRIPT, write_manifest
 
 from hwp_bench.methods.manifest import read_manifest
 from hwp_bench.run.runner import run_method
@@ -22,10 +23,7 @@ def run_walled(folder: Path, script: str, **confinement: Any) -> Any:
     method.mkdir(exist_ok=True)
     (folder / "request").mkdir()
     (method / "run.py").write_text(f"import json, os, sys\n{script}")
-    (method / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "looker"\n[entry]\n'
-        'command = ["{python}", "{method}/run.py", "{request}", "{output}"]\n'
-    )
+    write_manifest(method, "looker", SCRIPT)
     record = run_method(
         read_manifest(method),
         "tiny",

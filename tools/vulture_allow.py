@@ -35,7 +35,6 @@ _.request_share_url  # viser's server calls it
 verbose  # viser's server passes it
 _.channelnames  # OpenImageIO reads it
 _.camera_position  # pyvista reads it
-_.pareto  # read by the report's template
 _.perfect  # a fact of a metric, which tests compare the score of the truth with
 _.gain_deviation  # the table CUES names it; getattr reads it
 _.residual_deviation  # a measured cue of the pre-pass, for tests and benchmarks

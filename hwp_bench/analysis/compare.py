@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import combinations
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -30,25 +30,34 @@ from hwp_bench.taxonomy import PERTURBATIONS, perturbation
 ALPHA = 0.05
 
 
-@dataclass(frozen=True)
-class Difference:
+@dataclass(frozen=True, kw_only=True)
+class Contrast:
+    """A difference of paired scores in one metric and scope."""
+
+    #: Name of the metric.
+    metric: str
+    #: A scope of `analysis.pairing.scopes`.
+    scope: str
+    #: In the metric's unit.
+    estimate: Estimate
+    #: Probability that what is added makes the score better, in the metric's own direction.
+    better: float | None
+    #: p-value, adjusted over the perturbations for perturbations and over the pairs of methods
+    #: for the macro mean; None where nothing is adjusted.
+    p_adjusted: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Difference(Contrast):
     """One method less another in one scope."""
 
     #: Label of the first method.
     first: str
     #: Label of the second.
     second: str
-    #: Name of the metric.
-    metric: str
-    #: A scope of `analysis.pairing.scopes`.
-    scope: str
-    #: First less second, in the metric's unit.
-    estimate: Estimate
-    #: Probability that the first is better, in the metric's own direction.
-    better: float | None
-    #: p-value, adjusted over the perturbations for perturbations and over the pairs of methods
-    #: for the macro mean; None where nothing is adjusted.
-    p_adjusted: float | None = None
+
+
+_Contrast = TypeVar("_Contrast", bound=Contrast)
 
 
 @dataclass(frozen=True)
@@ -85,47 +94,49 @@ def compare(
     """
     differences: list[Difference] = []
     for first, second in combinations(runs, 2):
-        differences += _holm_perturbations(_pair(first, second, metric, resamples, seed, scope))
-    places = [index for index, item in enumerate(differences) if item.scope == MACRO]
-    _adjust(differences, places)
-    return differences
+        seeds = common_seeds(first, second)
+        terms = ((1.0, first), (-1.0, second))
+        differences += [
+            Difference(first=first.label, second=second.label, **vars(item))
+            for item in contrasts(terms, metric, seeds, resamples=resamples, seed=seed, only=scope)
+        ]
+    return _adjusted(differences, lambda found: found == MACRO)
 
 
-def _pair(
-    first: MethodRuns,
-    second: MethodRuns,
+def contrasts(
+    terms: Sequence[tuple[float, MethodRuns]],
     metric: str,
-    resamples: int,
-    seed: int,
-    only: str | None,
-) -> list[Difference]:
-    seeds = common_seeds(first, second)
+    seeds: Sequence[int],
+    *,
+    resamples: int = RESAMPLES,
+    seed: int = 0,
+    only: str | None = None,
+) -> list[Contrast]:
+    """Return the sum of runs, each times its factor, in every scope or the only one wanted.
+
+    p-values are adjusted over the perturbations.
+    """
     found = []
-    for scope, weights in scopes(first.first).items():
+    for scope, weights in scopes(terms[0][1].first).items():
         if only not in (None, scope):
             continue
         samples = [
-            first.values(capture, metric, seeds) - second.values(capture, metric, seeds)
+            np.sum([factor * run.values(capture, metric, seeds) for factor, run in terms], axis=0)
             for capture in weights
         ]
         estimate = bootstrap_mean(samples, list(weights.values()), resamples=resamples, seed=seed)
         better = estimate.above
         if better is not None and not metric_facts(metric).higher_is_better:
             better = 1 - better
-        found.append(Difference(first.label, second.label, metric, scope, estimate, better))
-    return found
+        found.append(Contrast(metric=metric, scope=scope, estimate=estimate, better=better))
+    return _adjusted(found, lambda scope: scope in PERTURBATIONS)
 
 
-def _holm_perturbations(found: list[Difference]) -> list[Difference]:
-    _adjust(found, [index for index, item in enumerate(found) if item.scope in PERTURBATIONS])
-    return found
-
-
-def _adjust(found: list[Difference], places: list[int]) -> None:
-    """Put Holm's p-values of one family into the list."""
-    tested = [(place, p) for place in places if (p := found[place].estimate.p) is not None]
-    for (place, _), value in zip(tested, holm([p for _, p in tested]), strict=True):
-        found[place] = replace(found[place], p_adjusted=value)
+def _adjusted(found: Sequence[_Contrast], in_family: Callable[[str], bool]) -> list[_Contrast]:
+    """Put Holm's p-values of the family of some scopes into the list."""
+    family = [item for item in found if in_family(item.scope) and item.estimate.p is not None]
+    adjusted = iter(holm([item.estimate.p or 0.0 for item in family]))
+    return [replace(item, p_adjusted=next(adjusted)) if item in family else item for item in found]
 
 
 def standings(
@@ -390,20 +401,27 @@ def scope_title(scope: str) -> str:
     return {MACRO: "Macro", "single": "Single", "interacting": "Interacting"}.get(scope, scope)
 
 
-def estimate_columns(metric: str) -> tuple[Column, ...]:
-    """Return the columns of an estimate in a metric: value, interval."""
+def contrast_columns(found: Sequence[Contrast], metric: str, better: str) -> list[Filled]:
+    """Return the columns of scope, estimate and tests, with the unit and digits of a metric."""
     facts = metric_facts(metric)
     unit = f" [{facts.unit}]" if facts.unit else ""
-    return (
-        Column(f"Difference{unit}", facts.digits),
-        Column("Low", facts.digits, group="95 % interval"),
-        Column("High", facts.digits, group="95 % interval"),
-    )
+    estimates = [item.estimate for item in found]
+    return [
+        (Column("Scope"), [scope_title(item.scope) for item in found]),
+        (Column("Captures", 0), [one.captures for one in estimates]),
+        (Column(f"Difference{unit}", facts.digits), [one.value for one in estimates]),
+        (Column("Low", facts.digits, group="95 % interval"), [one.low for one in estimates]),
+        (Column("High", facts.digits, group="95 % interval"), [one.high for one in estimates]),
+        (Column(better, 3), [item.better for item in found]),
+        (Column("p", 4), [one.p for one in estimates]),
+        (Column("p (Holm)", 4), [item.p_adjusted for item in found]),
+        (Column("Detectable", facts.digits), [one.detectable for one in estimates]),
+    ]
 
 
-def estimate_cells(estimate: Estimate) -> tuple[float | None, ...]:
-    """Return the cells of `estimate_columns`."""
-    return (estimate.value, estimate.low, estimate.high)
+def one_capture_notes(found: Sequence[Contrast]) -> list[str]:
+    """Return what is said under a table that has scopes of one capture."""
+    return [ONE_CAPTURE] if any(item.estimate.captures == 1 for item in found) else []
 
 
 def standings_table(metric: str, found: Sequence[Standing]) -> Table:
@@ -426,29 +444,18 @@ def standings_table(metric: str, found: Sequence[Standing]) -> Table:
 def differences_table(metric: str, found: Sequence[Difference]) -> Table:
     """Return one row a pair and scope."""
     facts = metric_facts(metric)
-    estimates = [item.estimate for item in found]
     columns: list[Filled] = [
         (Column("First"), [item.first for item in found]),
         (Column("Second"), [item.second for item in found]),
-        (Column("Scope"), [scope_title(item.scope) for item in found]),
-        (Column("Captures", 0), [one.captures for one in estimates]),
-        *(
-            (head, [estimate_cells(one)[place] for one in estimates])
-            for place, head in enumerate(estimate_columns(metric))
-        ),
-        (Column("P(first better)", 3), [item.better for item in found]),
-        (Column("p", 4), [one.p for one in estimates]),
-        (Column("p (Holm)", 4), [item.p_adjusted for item in found]),
-        (Column("Detectable", facts.digits), [one.detectable for one in estimates]),
+        *contrast_columns(found, metric, "P(first better)"),
     ]
     direction = "above" if facts.higher_is_better else "below"
     notes = [
         f"First less second; {direction} 0 the first is better. {_INTERVAL}",
         "p (Holm): over the perturbations of a pair, and over the pairs for the macro mean. "
         "Detectable: the true difference that such a comparison finds with 80 % probability.",
+        *one_capture_notes(found),
     ]
-    if any(item.estimate.captures == 1 for item in found):
-        notes.append(ONE_CAPTURE)
     return table_of(f"{facts.label}: differences", columns, notes)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -88,16 +88,6 @@ class MethodCost:
         return per_second(1, self.render_seconds)
 
     @property
-    def render_ms(self) -> float | None:
-        """Milliseconds to render one frame."""
-        return 1000 * self.render_seconds if self.render_seconds else None
-
-    @property
-    def step_ms(self) -> float | None:
-        """Milliseconds of a step."""
-        return 1000 * self.fit_seconds / self.steps if self.fit_seconds and self.steps else None
-
-    @property
     def peak_gb(self) -> float | None:
         """Largest peak memory, GB."""
         return self.peak_memory / 1e9 if self.peak_memory else None
@@ -108,101 +98,82 @@ def method_curves(run: MethodRuns, metric: str) -> dict[str, list[Curve]]:
     found: dict[str, list[Curve]] = {}
     for _, results in sorted(run.seeds.items()):
         for capture in results.captures:
-            curve = curve_of(capture, metric)
-            if curve is not None:
+            if (curve := curve_of(capture, metric)) is not None:
                 found.setdefault(capture.id, []).append(curve)
     return found
 
 
-def window(curves: Sequence[Mapping[str, Sequence[Curve]]]) -> tuple[float, float] | None:
+def window(curves: Iterable[Mapping[str, Sequence[Curve]]]) -> tuple[float, float] | None:
     """Return the seconds over which all methods can be compared.
 
     From the moment when every fit of every method has had a checkpoint to the end of the longest
     fit (one that ended earlier keeps its score). None where that leaves no time.
     """
     every = [curve for method in curves for fits in method.values() for curve in fits]
-    if not every:
-        return None
-    start = max(float(curve.seconds[0]) for curve in every)
-    stop = max(float(curve.seconds[-1]) for curve in every)
+    start = max((float(curve.seconds[0]) for curve in every), default=0.0)
+    stop = max((float(curve.seconds[-1]) for curve in every), default=0.0)
     return (start, stop) if stop > start else None
 
 
 def method_costs(
     runs: Sequence[MethodRuns],
     metric: str,
-    *,
     budgets: Sequence[float] = BUDGETS,
     reference: MethodRuns | None = None,
 ) -> list[MethodCost]:
-    """Return the cost of every method."""
-    curves = [method_curves(run, metric) for run in runs]
-    stretch = window(curves)
-    longest = max(
-        (float(c.seconds[-1]) for method in curves for fits in method.values() for c in fits),
-        default=0.0,
-    )
-    reached = [budget for budget in budgets if budget <= longest]
-    targets = (
-        {name: float(np.mean([c.final for c in fits])) for name, fits in known.items()}
-        if reference is not None and (known := method_curves(reference, metric))
-        else None
-    )
-    return [
-        _method_cost(run, metric, method, reached, targets, stretch)
-        for run, method in zip(runs, curves, strict=True)
-    ]
-
-
-def _method_cost(
-    run: MethodRuns,
-    metric: str,
-    curves: Mapping[str, Sequence[Curve]],
-    budgets: Sequence[float],
-    targets: Mapping[str, float] | None,
-    stretch: tuple[float, float] | None,
-) -> MethodCost:
+    """Return the cost of every method; of the budgets those that a fit reaches."""
     facts = metric_facts(metric)
     higher = facts.higher_is_better
-    every = [curve for fits in curves.values() for curve in fits]
-    captures = [capture for results in run.seeds.values() for capture in results.captures]
-    to_reference = None
-    if targets is not None:
-        times = [
-            c.time_to(targets[n], higher) for n, f in curves.items() if n in targets for c in f
-        ]
-        to_reference = _reach(times)
-    signs = -1 if higher else 1
-    near = NEAR if facts.unit == "dB" else ()
-    frames = sum(len(capture.frames) for capture in captures)
-    return MethodCost(
-        label=run.label,
-        metric=metric,
-        final=_mean([curve.final for curve in every]),
-        at={budget: _mean([float(c.at(budget)) for c in every]) for budget in budgets},
-        to_reference=to_reference,
-        to_own={
-            step: _reach([c.time_to(c.final + signs * step, higher) for c in every])
-            for step in near
-        },
-        area=_mean([curve.log_area(*stretch) for curve in every]) if stretch else None,
-        fit_seconds=_mean([c.fit_seconds for c in captures if c.fit_seconds is not None]),
-        cpu_seconds=_mean([c.cpu_seconds for c in captures if c.cpu_seconds is not None]),
-        steps=_mean([float(c.steps) for c in captures if c.steps is not None]),
-        render_seconds=_render_seconds(captures),
-        score_seconds=sum(capture.score_seconds for capture in captures) / max(frames, 1),
-        wall_seconds=_mean([capture.wall_seconds for capture in captures]) or 0.0,
-        peak_memory=max(
-            (c.peak_memory for c in captures if c.peak_memory is not None), default=None
-        ),
-        devices=tuple(sorted({c.device for c in captures if c.device})),
-        curves=len(every),
-        fits=len(captures),
+    methods = [method_curves(run, metric) for run in runs]
+    stretch = window(methods)
+    longest = max(
+        (c.seconds[-1] for own in methods for fits in own.values() for c in fits), default=0
     )
+    known = method_curves(reference, metric) if reference is not None else {}
+    targets = {name: float(np.mean([c.final for c in fits])) for name, fits in known.items()}
+    costs = []
+    for run, own in zip(runs, methods, strict=True):
+        every = [curve for fits in own.values() for curve in fits]
+        captures = [capture for results in run.seeds.values() for capture in results.captures]
+        timed = [capture for capture in captures if capture.render_seconds]
+        near = {
+            step: [c.time_to(c.final + (-step if higher else step), higher) for c in every]
+            for step in (NEAR if facts.unit == "dB" else ())
+        }
+        there = [
+            c.time_to(targets[name], higher)
+            for name, fits in own.items()
+            if name in targets
+            for c in fits
+        ]
+        costs.append(
+            MethodCost(
+                label=run.label,
+                metric=metric,
+                final=_mean([curve.final for curve in every]),
+                at={b: _mean([float(c.at(b)) for c in every]) for b in budgets if b <= longest},
+                to_reference=_reach(there) if targets else None,
+                to_own={step: _reach(times) for step, times in near.items()},
+                area=_mean([curve.log_area(*stretch) for curve in every]) if stretch else None,
+                fit_seconds=_mean([c.fit_seconds for c in captures]),
+                cpu_seconds=_mean([c.cpu_seconds for c in captures]),
+                steps=_mean([c.steps for c in captures]),
+                render_seconds=_per_frame([c.render_seconds or 0.0 for c in timed], timed),
+                score_seconds=_per_frame([c.score_seconds for c in captures], captures) or 0.0,
+                wall_seconds=_mean([capture.wall_seconds for capture in captures]) or 0.0,
+                peak_memory=max((c.peak_memory or 0 for c in captures), default=0) or None,
+                devices=tuple(sorted({c.device for c in captures if c.device})),
+                curves=len(every),
+                fits=len(captures),
+            )
+        )
+    return costs
 
 
-def _mean(values: Sequence[float]) -> float | None:
-    mean = float(np.mean(values)) if values else math.nan
+def _mean(values: Iterable[float | None]) -> float | None:
+    """The mean of what is known; None where nothing is, or the mean is no number."""
+    known = [value for value in values if value is not None]
+    mean = float(np.mean(known)) if known else math.nan
     return mean if math.isfinite(mean) else None
 
 
@@ -213,9 +184,9 @@ def _reach(times: Sequence[float]) -> Reach:
     return Reach(median if math.isfinite(median) else None, count, len(times))
 
 
-def _render_seconds(captures: Sequence[CaptureResult]) -> float | None:
-    timed = [(c.render_seconds, len(c.frames)) for c in captures if c.render_seconds]
-    return sum(spent for spent, _ in timed) / sum(n for _, n in timed) if timed else None
+def _per_frame(seconds: Sequence[float], captures: Sequence[CaptureResult]) -> float | None:
+    frames = sum(len(capture.frames) for capture in captures)
+    return sum(seconds) / frames if frames else None
 
 
 #: The parts of a run, in the order of time, with what they hold.
@@ -228,23 +199,6 @@ PARTS: Mapping[str, str] = {
 }
 
 
-def cost_tables(
-    costs: Sequence[MethodCost],
-    front: Sequence[FrontPart],
-    metric: str,
-    *,
-    reference: str | None,
-    stretch: tuple[float, float] | None,
-    notes: Sequence[str] = (),
-) -> dict[str, Table]:
-    """Return the tables by name: `cost`, `times`, `front`."""
-    return {
-        "cost": _cost_table(costs, metric, reference, stretch, notes),
-        "times": _times_table(costs),
-        "front": _front_table(front, metric),
-    }
-
-
 def _cost_table(
     costs: Sequence[MethodCost],
     metric: str,
@@ -252,27 +206,27 @@ def _cost_table(
     stretch: tuple[float, float] | None,
     notes: Sequence[str],
 ) -> Table:
-    facts = metric_facts(metric)
-    better = facts.higher_is_better
-    score = score_title(metric)
-    columns: list[Filled] = [(Column("Method"), [cost.label for cost in costs])]
-    for budget in costs[0].at:
-        head = Column(f"{budget:g} s", facts.digits, better, f"{score} after")
-        columns.append((head, [cost.at[budget] for cost in costs]))
-    columns.append((Column("Final", facts.digits, better, score), [cost.final for cost in costs]))
+    facts, score = metric_facts(metric), score_title(metric)
+
+    def scored(title: str, group: str) -> Column:
+        return Column(title, facts.digits, facts.higher_is_better, group)
+
+    columns: list[Filled] = [
+        (Column("Method"), [cost.label for cost in costs]),
+        *(
+            (scored(f"{budget:g} s", f"{score} after"), [cost.at[budget] for cost in costs])
+            for budget in costs[0].at
+        ),
+        (scored("Final", score), [cost.final for cost in costs]),
+    ]
     if stretch:
-        head = Column("Mean over log time", facts.digits, better, score)
-        columns.append((head, [cost.area for cost in costs]))
+        columns.append((scored("Mean over log time", score), [cost.area for cost in costs]))
     if reference is not None:
         reach = [cost.to_reference for cost in costs]
-        seconds = [one.seconds if one else None for one in reach]
-        columns += [
-            (Column(f"To final of {reference}", 1, False, "Seconds"), seconds),
-            (
-                Column("Fits that get there"),
-                [f"{one.reached} of {one.fits}" if one else None for one in reach],
-            ),
-        ]
+        counts = [f"{one.reached} of {one.fits}" if one else None for one in reach]
+        head = Column(f"To final of {reference}", 1, False, "Seconds")
+        columns.append((head, [one.seconds if one else None for one in reach]))
+        columns.append((Column("Fits that get there"), counts))
     for step in costs[0].to_own:
         head = Column(f"To own final within {step:g} dB", 1, False, "Seconds")
         columns.append((head, [cost.to_own[step].seconds for cost in costs]))
@@ -295,8 +249,8 @@ def _times_table(costs: Sequence[MethodCost]) -> Table:
         (Column("Fit [s]", 1), [cost.fit_seconds for cost in costs]),
         (Column("On one core [s]", 1), [cost.cpu_seconds for cost in costs]),
         (Column("Steps", 0), [cost.steps for cost in costs]),
-        (Column("Step [ms]", 1), [cost.step_ms for cost in costs]),
-        (Column("Render [ms/frame]", 1), [cost.render_ms for cost in costs]),
+        (Column("Step [ms]", 1), [_ms(cost.fit_seconds, cost.steps) for cost in costs]),
+        (Column("Render [ms/frame]", 1), [_ms(cost.render_seconds) for cost in costs]),
         (Column("Render [frames/s]", 1), [cost.frames_per_second for cost in costs]),
         (Column("Score [ms/frame]", 1), [1000 * cost.score_seconds for cost in costs]),
         (Column("Whole process [s]", 1), [cost.wall_seconds for cost in costs]),
@@ -308,6 +262,10 @@ def _times_table(costs: Sequence[MethodCost]) -> Table:
         "checkpoints and rendering included. On one core: CPU seconds of the fit, all threads."
     )
     return table_of("Times and memory", columns, [note])
+
+
+def _ms(seconds: float | None, count: float | None = 1.0) -> float | None:
+    return 1000 * seconds / count if seconds and count else None
 
 
 def _front_table(front: Sequence[FrontPart], metric: str) -> Table:
@@ -354,18 +312,13 @@ def run_seconds(capture: CaptureResult) -> dict[str, float] | None:
 
 def seconds_table(runs: Sequence[MethodRuns]) -> Table | None:
     """Return one row a part of the runs, and their sum; None where nothing is on record."""
-    every = [
-        run_seconds(capture)
-        for run in runs
-        for result in run.seeds.values()
-        for capture in result.captures
-    ]
+    results = [result for run in runs for result in run.seeds.values()]
+    every = [run_seconds(capture) for result in results for capture in result.captures]
     known = [parts for parts in every if parts is not None]
     whole = sum(sum(parts.values()) for parts in known)
     if not whole:
         return None
-    sums = [sum(parts[name] for parts in known) for name in PARTS]
-    spent = [*sums, whole]
+    spent = [*(sum(parts[name] for parts in known) for name in PARTS), whole]
     columns: list[Filled] = [
         (Column("Part"), [*PARTS, "sum"]),
         (Column("Mean of a run [s]", 2), [seconds / len(known) for seconds in spent]),
@@ -400,22 +353,15 @@ class CostAnalysis:
 
     def as_object(self) -> dict[str, Any]:
         """Return plain JSON data."""
-        curves = [
-            {
-                "label": curve.label,
-                "seconds": curve.seconds.tolist(),
-                "scores": curve.scores.tolist(),
-                "low": None if curve.low is None else curve.low.tolist(),
-                "high": None if curve.high is None else curve.high.tolist(),
-            }
-            for curve in self.curves
-        ]
         return {
             "metric": self.metric,
             "methods": [
                 {**asdict(cost), "frames_per_second": cost.frames_per_second} for cost in self.costs
             ],
-            "curves": curves,
+            "curves": [
+                {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in vars(curve).items()}
+                for curve in self.curves
+            ],
             "front": [asdict(part) for part in self.front],
         }
 
@@ -423,38 +369,31 @@ class CostAnalysis:
 def analyse_cost(
     runs: Sequence[MethodRuns],
     metric: str,
-    *,
     budgets: Sequence[float] = BUDGETS,
     reference: MethodRuns | None = None,
 ) -> CostAnalysis:
-    """Analyse accuracy against time."""
+    """Analyse accuracy against time; tables `cost`, `times`, `front`, and `seconds` where known."""
     if reference is None:
-        plain = [run for run in runs if run.first.method.name == PLAIN]
-        reference = plain[0] if plain else None
+        reference = next((run for run in runs if run.first.method.name == PLAIN), None)
     refuse_unlike([*runs, *([reference] if reference else [])])
     methods = [method_curves(run, metric) for run in runs]
-    curves = [
-        curve
-        for run, method in zip(runs, methods, strict=True)
-        if (curve := mean_curve(run.label, method)) is not None
-    ]
+    named = zip(runs, methods, strict=True)
+    curves = [curve for run, own in named if (curve := mean_curve(run.label, own)) is not None]
     if not curves:
         raise UsageError(
             f"no result has a curve of {metric}",
             field="metric",
             remedy="Methods leave curves by calling `report` while they fit (docs/methods.md).",
         )
-    costs = method_costs(runs, metric, budgets=budgets, reference=reference)
+    costs = method_costs(runs, metric, budgets, reference)
     front = pareto_front(curves, metric_facts(metric).higher_is_better)
-    tables = cost_tables(
-        costs,
-        front,
-        metric,
-        reference=reference.label if reference else None,
-        stretch=window(methods),
-        notes=machine_notes([result for run in runs for result in run.seeds.values()]),
-    )
-    seconds = seconds_table(runs)
-    if seconds is not None:
+    notes = machine_notes([result for run in runs for result in run.seeds.values()])
+    label = reference.label if reference else None
+    tables = {
+        "cost": _cost_table(costs, metric, label, window(methods), notes),
+        "times": _times_table(costs),
+        "front": _front_table(front, metric),
+    }
+    if (seconds := seconds_table(runs)) is not None:
         tables["seconds"] = seconds
     return CostAnalysis(metric, tuple(costs), tuple(curves), tuple(front), tables)

@@ -3,25 +3,31 @@
 from __future__ import annotations
 
 import argparse
-import json
 import shlex
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from hwp_bench.base.console import JobsView, notice, track
+from hwp_bench.base.errors import UsageError, shown
+from hwp_bench.base.files import check_places
+from hwp_bench.base.tables import print_table
 from hwp_bench.cli.options import (
+    SEVERAL,
     add_force,
     add_json,
+    add_out,
     add_splits,
     add_suite_or_captures,
+    named_table,
     print_json,
+    print_result,
     splits_of,
 )
 
 if TYPE_CHECKING:
     from hwp_bench.capture.check import CheckReport
     from hwp_bench.capture.splits import AuditReport
-    from hwp_bench.tracking import TrackedVideo
 
 _CHECK = """examples:
   hwp-bench data check my_capture
@@ -31,39 +37,30 @@ Exit status 0: every capture is sound; 1: at least one is not.
 """
 
 
-def add_check(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `data check`."""
+def _add_check(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _CHECK
     parser.add_argument("captures", nargs="+", metavar="CAPTURE", help="capture folder")
     add_json(parser, "print the report as JSON")
 
 
-def do_check(args: argparse.Namespace) -> int:
-    """Run `data check`."""
-    from hwp_bench.base.console import track
+def _check(args: argparse.Namespace) -> int:
     from hwp_bench.capture.check import check_capture
 
     reports = [check_capture(path) for path in track(args.captures, "checking captures")]
     if args.json:
         print_json([{"ok": report.ok, **asdict(report)} for report in reports])
-    else:
-        for report in reports:
-            _print_check(report)
+    for report in () if args.json else reports:
+        _print_check(report)
     return 0 if all(report.ok for report in reports) else 1
 
 
 def _print_check(report: CheckReport) -> None:
-    from hwp_bench.base.errors import shown
-    from hwp_bench.base.tables import Column, Table, print_table
-
-    title = shown(report.path)
-    verdict = "sound" if report.ok else "NOT SOUND"
-    rows = tuple((name, _fact(value)) for name, value in report.facts.items())
-    if rows:
-        columns = (Column("fact"), Column("value"))
-        print_table(Table(f"{title}: {verdict}", columns, rows))
+    title = f"{shown(report.path)}: {'sound' if report.ok else 'NOT SOUND'}"
+    if report.facts:
+        rows = [(name, _fact(value)) for name, value in report.facts.items()]
+        print_table(named_table(title, "fact, value", rows))
     else:
-        print(f"{title}: {verdict}")
+        print(title)
     for finding in report.findings:
         parts = (finding.level, finding.where, finding.field, finding.problem)
         remedy = f" {finding.remedy}" if finding.remedy else ""
@@ -92,21 +89,16 @@ it (hoi: interaction, cp: complex poses, il: illumination, mb: motion blur).
 """
 
 
-def add_show(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `data show`."""
+def _add_show(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _SHOW
-    parser.add_argument("capture", metavar="CAPTURE", help="capture folder")
-    parser.add_argument("-o", "--out", help="PNG to write (default: ID-sheet.png here)")
-    parser.add_argument("--count", type=int, default=24, help="frames on the sheet (default 24)")
-    parser.add_argument(
-        "--edge", type=int, default=256, help="larger side of a frame, px (default 256)"
-    )
+    add = parser.add_argument
+    add("capture", metavar="CAPTURE", help="capture folder")
+    add("-o", "--out", help="PNG to write (default: ID-sheet.png here)")
+    add("--count", type=int, default=24, help="frames on the sheet (default 24)")
+    add("--edge", type=int, default=256, help="larger side of a frame, px (default 256)")
 
 
-def do_show(args: argparse.Namespace) -> int:
-    """Run `data show`."""
-    from hwp_bench.base.errors import UsageError
-    from hwp_bench.base.files import check_places
+def _show(args: argparse.Namespace) -> int:
     from hwp_bench.base.images import write_image
     from hwp_bench.capture import open_capture
     from hwp_bench.capture.check import contact_sheet
@@ -130,21 +122,16 @@ Near-copies across the border are reported and do not change the status.
 """
 
 
-def add_audit(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `data audit`."""
+def _add_audit(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _AUDIT
     parser.add_argument("captures", nargs="+", metavar="CAPTURE", help="capture folder")
     add_splits(parser)
-    parser.add_argument(
-        "--guard", type=int, default=0, help="frames left out before each border (default 0)"
-    )
+    guard = "frames left out before each border (default 0)"
+    parser.add_argument("--guard", type=int, default=0, help=guard)
     add_json(parser, "print the reports as JSON")
 
 
-def do_audit(args: argparse.Namespace) -> int:
-    """Run `data audit`."""
-    from hwp_bench.base.console import track
-    from hwp_bench.base.errors import UsageError
+def _audit(args: argparse.Namespace) -> int:
     from hwp_bench.capture import open_capture
     from hwp_bench.capture.splits import audit_split, contiguous_split, split_for
 
@@ -161,24 +148,19 @@ def do_audit(args: argparse.Namespace) -> int:
         reports.append(audit_split(capture, split))
     if args.json:
         print_json([{"ok": report.ok, **asdict(report)} for report in reports])
-    else:
-        for report in reports:
-            _print_audit(report)
+    for report in () if args.json else reports:
+        _print_audit(report)
     return 0 if all(report.ok for report in reports) else 1
 
 
 def _print_audit(report: AuditReport) -> None:
-    from hwp_bench.base.tables import Column, Table, print_table
-
-    closest = min(report.near_duplicates, key=lambda pair: pair[2], default=None)
-    near = "none"
-    if closest is not None:
+    near = hashes = "none"
+    if report.near_duplicates:
+        test, other, apart = min(report.near_duplicates, key=lambda pair: pair[2])
         near = (
-            f"{len(report.near_duplicates)}; the closest: test frame {closest[0]} and frame "
-            f"{closest[1]}, RMS {closest[2]:.2f} levels; none with a guard gap of "
-            f"{report.guard_needed} frames"
+            f"{len(report.near_duplicates)}; the closest: test frame {test} and frame {other}, "
+            f"RMS {apart:.2f} levels; none with a guard gap of {report.guard_needed} frames"
         )
-    hashes = "none"
     if report.same_hashes:
         hashes = (
             f"{len(report.same_hashes)} pairs; none with a guard gap of "
@@ -195,8 +177,7 @@ def _print_audit(report: AuditReport) -> None:
         ("one perceptual hash across the border", hashes),
     )
     verdict = "fair" if report.ok else "NOT FAIR"
-    columns = (Column("question"), Column("answer"))
-    print_table(Table(f"{report.capture}: {verdict}", columns, rows))
+    print_table(named_table(f"{report.capture}: {verdict}", "question, answer", rows))
 
 
 _GET = """examples:
@@ -209,56 +190,40 @@ interrupted download. Checksums are pinned on first use; existing files are neve
 """
 
 
-def add_get(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `data get`."""
+def _add_get(parser: argparse.ArgumentParser) -> None:
     parser.description = "Download a public data set."
     parser.epilog = _GET
-    parser.add_argument("name", choices=("hwp",), help="hwp: the official release")
-    parser.add_argument(
-        "-o", "--out", type=Path, default=Path("WildGHand"), metavar="DIR", help="folder to make"
-    )
-    parser.add_argument(
-        "--capture",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="NAME",
-        help="only folders whose names begin with this",
-    )
-    parser.add_argument("--revision", help="branch, tag or commit (default: the newest)")
+    add = parser.add_argument
+    add("name", choices=("hwp",), help="hwp: the official release")
+    out = Path("WildGHand")
+    add("-o", "--out", type=Path, default=out, metavar="DIR", help="folder to make")
+    text = "only folders whose names begin with this"
+    add("--capture", **SEVERAL, metavar="NAME", help=text)
+    add("--revision", help="branch, tag or commit (default: the newest)")
     add_json(parser, "print what was downloaded as JSON")
 
 
-def do_get(args: argparse.Namespace) -> int:
-    """Run `data get`."""
-    from hwp_bench.base.console import JobsView, notice
-    from hwp_bench.base.files import check_places
+def _get(args: argparse.Namespace) -> int:
     from hwp_bench.importers.official.download import HuggingFaceHub, download_release
 
     check_places({"--out": args.out}, {})
     with JobsView() as jobs:
-        update = jobs.turn(0, 1, f"downloading to {args.out}")
         made = download_release(
             args.out,
             HuggingFaceHub(),
             captures=args.capture,
             revision=args.revision,
-            update=update,
+            update=jobs.turn(0, 1, f"downloading to {args.out}"),
         )
     for name in made.archives:
         notice(f"warning: {name} is an archive; it is left packed")
-    if args.json:
-        value = {
-            "folder": str(made.folder),
-            "commit": made.commit,
-            "files": made.files,
-            "kept": made.kept,
-        }
-        print_json(value)
-        return 0
-    print(f"folder: {made.folder}, {len(made.files)} files, {made.kept} of them existed before")
-    print(f"commit: {made.commit}")
-    return 0
+    folder, files = str(made.folder), made.files
+    value = {"folder": folder, "commit": made.commit, "files": files, "kept": made.kept}
+    lines = (
+        f"folder: {folder}, {len(files)} files, {made.kept} of them existed before",
+        f"commit: {made.commit}",
+    )
+    return print_result(args.json, value, lines)
 
 
 _TRACK = """examples:
@@ -273,54 +238,36 @@ result; docs/video.md describes it.
 """
 
 
-def add_track(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `data track`."""
+def _add_track(parser: argparse.ArgumentParser) -> None:
     parser.description = "Track the hands of a video."
     parser.epilog = _TRACK
-    parser.add_argument("video", type=Path, nargs="?", metavar="VIDEO", help="not mirrored")
-    parser.add_argument(
-        "-o", "--out", type=Path, metavar="NPZ", help="file to write (default: VIDEO.npz)"
-    )
-    parser.add_argument(
-        "--hands", type=int, choices=(1, 2), default=2, help="most hands in a frame (default: 2)"
-    )
-    parser.add_argument(
-        "--min-confidence",
-        type=float,
-        default=0.5,
-        metavar="P",
-        help="palms and hands below this are left out (default: 0.5)",
-    )
-    parser.add_argument(
-        "--model",
-        type=Path,
-        metavar="FILE",
-        help="networks: a hand_landmarker.task, a wheel of MediaPipe 0.10.21, or a folder",
-    )
-    parser.add_argument("--sheet", type=Path, metavar="IMAGE", help="draw a contact sheet")
-    parser.add_argument(
-        "--fetch", action="store_true", help="download the networks and say where they are"
-    )
-    parser.add_argument("--force", action="store_true", help="replace an existing file")
+    add = parser.add_argument
+    add("video", type=Path, nargs="?", metavar="VIDEO", help="not mirrored")
+    out = "file to write (default: VIDEO.npz)"
+    add("-o", "--out", type=Path, metavar="NPZ", help=out)
+    hands = "most hands in a frame (default: 2)"
+    add("--hands", type=int, choices=(1, 2), default=2, help=hands)
+    least = "palms and hands below this are left out (default: 0.5)"
+    add("--min-confidence", type=float, default=0.5, metavar="P", help=least)
+    model = "networks: a hand_landmarker.task, a wheel of MediaPipe 0.10.21, or a folder"
+    add("--model", type=Path, metavar="FILE", help=model)
+    add("--sheet", type=Path, metavar="IMAGE", help="draw a contact sheet")
+    add("--fetch", action="store_true", help="download the networks and say where they are")
+    add("--force", action="store_true", help="replace an existing file")
     add_json(parser, "print the numbers as JSON")
 
 
-def do_track(args: argparse.Namespace) -> int:
-    """Run `data track`."""
-    from hwp_bench.base.errors import UsageError
-    from hwp_bench.base.files import check_places
+def _track(args: argparse.Namespace) -> int:
     from hwp_bench.tracking import TrackerSettings, fetch_models, track_video
 
     if args.fetch:
         folder = fetch_models()
-        print(json.dumps({"models": str(folder)}) if args.json else f"networks: {folder}")
-        return 0
+        return print_result(args.json, {"models": str(folder)}, [f"networks: {folder}"])
     if args.video is None:
         raise UsageError("VIDEO is missing", remedy="Give a video, or --fetch.")
     out = args.out or args.video.with_suffix(".npz")
-    check_places(
-        {"--out": out, "--sheet": args.sheet}, {"VIDEO": args.video, "--model": args.model}
-    )
+    outputs = {"--out": out, "--sheet": args.sheet}
+    check_places(outputs, {"VIDEO": args.video, "--model": args.model})
     least = args.min_confidence
     tracked = track_video(
         args.video,
@@ -334,23 +281,15 @@ def do_track(args: argparse.Namespace) -> int:
         from hwp_bench.tracking.track_video import landmark_sheet
 
         write_image(args.sheet, landmark_sheet(tracked))
-    if args.json:
-        print_json({"landmarks": str(out), **tracked.facts()})
-    else:
-        _print_track(tracked, out)
-    return 0
-
-
-def _print_track(tracked: TrackedVideo, out: Path) -> None:
     facts = tracked.facts()
     frames = tracked.reading.counted()
-    print(f"{out}: {frames} frames, {facts['frames_per_second']:.1f} frames per second")
-    for hand in facts["hands"]:
-        print(
-            f"{hand['side']} hand: seen in {hand['frames_seen']} frames, {hand['tracks']} tracks, "
-            f"score {hand['mean_score']:.3f}; votes: right {hand['right']:.2f}, "
-            f"left {hand['left']:.2f}"
-        )
+    lines = [f"{out}: {frames} frames, {facts['frames_per_second']:.1f} frames per second"]
+    lines += [
+        f"{hand['side']} hand: seen in {hand['frames_seen']} frames, {hand['tracks']} tracks, "
+        f"score {hand['mean_score']:.3f}; votes: right {hand['right']:.2f}, left {hand['left']:.2f}"
+        for hand in facts["hands"]
+    ]
+    return print_result(args.json, {"landmarks": str(out), **facts}, lines)
 
 
 _INPUTS = """examples:
@@ -364,22 +303,18 @@ frames are to be drawn. The program writes them to inputs/submission/predictions
 """
 
 
-def add_inputs(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `data inputs`."""
+def _add_inputs(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _INPUTS
     add_suite_or_captures(parser)
-    parser.add_argument("-o", "--out", type=Path, required=True, metavar="DIR", help="new folder")
-    parser.add_argument(
-        "--name", default="mine", help="short name of your method in tables (default mine)"
-    )
+    add_out(parser, "new folder")
+    name = "short name of your method in tables (default mine)"
+    parser.add_argument("--name", default="mine", help=name)
     add_json(parser, "print what was written as JSON")
 
 
-def do_inputs(args: argparse.Namespace) -> int:
-    """Run `data inputs`."""
-    from hwp_bench.base.files import check_places
+def _inputs(args: argparse.Namespace) -> int:
     from hwp_bench.commitments.inputs import check_place, write_inputs
-    from hwp_bench.evaluation.evaluate import open_captures
+    from hwp_bench.commitments.publication import open_captures
     from hwp_bench.sim import ensure_suite
 
     # Before a suite is rendered.
@@ -391,19 +326,18 @@ def do_inputs(args: argparse.Namespace) -> int:
     data += ["--splits", args.splits] if args.splits else []
     score = shlex.join(["hwp-bench", "evaluate", str(args.out / "submission"), *data])
     made = write_inputs(open_captures(paths, splits), args.out, name=args.name, score=score)
-    if args.json:
-        value = {
-            "requests": str(made.requests),
-            "submission": str(made.submission),
-            "frames": dict(made.wanted),
-            "score": score,
-        }
-        print_json(value)
-        return 0
-    print(f"to read: {made.requests} ({len(made.wanted)} captures)")
-    print(f"to fill: {made.submission}/predictions ({sum(made.wanted.values())} frames)")
-    print(f"then: {score}")
-    return 0
+    value = {
+        "requests": str(made.requests),
+        "submission": str(made.submission),
+        "frames": dict(made.wanted),
+        "score": score,
+    }
+    lines = (
+        f"to read: {made.requests} ({len(made.wanted)} captures)",
+        f"to fill: {made.submission}/predictions ({sum(made.wanted.values())} frames)",
+        f"then: {score}",
+    )
+    return print_result(args.json, value, lines)
 
 
 _PUBLISH = """examples:
@@ -417,42 +351,34 @@ salt of the commitment that the public manifest carries.
 """
 
 
-def add_publish(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `data publish`."""
+def _add_publish(parser: argparse.ArgumentParser) -> None:
     parser.description = "Divide captures into a public and a sealed part."
     parser.epilog = _PUBLISH
-    parser.add_argument(
-        "captures", nargs="+", type=Path, metavar="CAPTURES", help="capture folders"
-    )
-    parser.add_argument(
-        "-o", "--out", type=Path, required=True, metavar="DIR", help="folder to make"
-    )
+    captures = "capture folders"
+    parser.add_argument("captures", nargs="+", type=Path, metavar="CAPTURES", help=captures)
+    add_out(parser, "folder to make")
     add_splits(parser)
     add_json(parser, "print what was written as JSON")
 
 
-def do_publish(args: argparse.Namespace) -> int:
-    """Run `data publish`."""
-    from hwp_bench.base.files import check_places
+def _publish(args: argparse.Namespace) -> int:
     from hwp_bench.commitments import publish
 
     check_places({"--out": args.out}, {"CAPTURES": args.captures, "--splits": args.splits})
-    splits = splits_of(args)
-    made = publish(args.captures, args.out, splits=splits)
-    if args.json:
-        value = {
-            "public": str(made.public),
-            "sealed": str(made.sealed),
-            "commitment": made.commitment,
-            "captures": list(made.captures),
-        }
-        print_json(value)
-        return 0
-    print(f"captures: {', '.join(made.captures)}")
-    print(f"for authors: {made.public}")
-    print(f"keep secret: {made.sealed}")
-    print(f"commitment: {made.commitment}")
-    return 0
+    made = publish(args.captures, args.out, splits=splits_of(args))
+    value = {
+        "public": str(made.public),
+        "sealed": str(made.sealed),
+        "commitment": made.commitment,
+        "captures": list(made.captures),
+    }
+    lines = (
+        f"captures: {', '.join(made.captures)}",
+        f"for authors: {made.public}",
+        f"keep secret: {made.sealed}",
+        f"commitment: {made.commitment}",
+    )
+    return print_result(args.json, value, lines)
 
 
 _CONVERT = """examples:
@@ -464,41 +390,32 @@ of the fit. True hand parameters are left out: they belong to the old model.
 """
 
 
-def add_convert(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `hands convert`."""
+def _add_convert(parser: argparse.ArgumentParser) -> None:
     parser.description = "Convert a capture's hands to another hand model."
     parser.epilog = _CONVERT
-    parser.add_argument("capture", type=Path, metavar="CAPTURE", help="capture folder")
-    parser.add_argument("out", type=Path, metavar="OUT", help="capture folder to make")
-    parser.add_argument(
-        "--hand-model", required=True, metavar="MODEL", help="anny, mano:PATH or mano-hd:PATH"
-    )
+    add = parser.add_argument
+    add("capture", type=Path, metavar="CAPTURE", help="capture folder")
+    add("out", type=Path, metavar="OUT", help="capture folder to make")
+    add("--hand-model", required=True, metavar="MODEL", help="anny, mano:PATH or mano-hd:PATH")
     add_force(parser)
     add_json(parser, "print the errors as JSON")
 
 
-def do_convert(args: argparse.Namespace) -> int:
-    """Run `hands convert`."""
-    from hwp_bench.base.files import check_places
+def _convert(args: argparse.Namespace) -> int:
     from hwp_bench.capture import open_capture
     from hwp_bench.capture.convert import convert_capture
 
-    check_places(
-        {"OUT": args.out}, {"CAPTURE": args.capture}, replaces=args.force, makes_captures=True
-    )
-    errors = convert_capture(
-        open_capture(args.capture), args.out, args.hand_model, overwrite=args.force
-    )
-    if args.json:
-        print_json({side: asdict(error) for side, error in errors.items()})
-        return 0
-    for side, error in errors.items():
-        print(
-            f"{side} hand: skin {error.skin_mm:.2f} mm (worst frame {error.worst_skin_mm:.2f}), "
-            f"landmarks {error.landmark_mm:.2f} mm"
-        )
-    print(f"capture: {args.out}")
-    return 0
+    inputs = {"CAPTURE": args.capture}
+    check_places({"OUT": args.out}, inputs, replaces=args.force, makes_captures=True)
+    capture = open_capture(args.capture)
+    errors = convert_capture(capture, args.out, args.hand_model, overwrite=args.force)
+    lines = [
+        f"{side} hand: skin {error.skin_mm:.2f} mm (worst frame {error.worst_skin_mm:.2f}), "
+        f"landmarks {error.landmark_mm:.2f} mm"
+        for side, error in errors.items()
+    ]
+    value = {side: asdict(error) for side, error in errors.items()}
+    return print_result(args.json, value, [*lines, f"capture: {args.out}"])
 
 
 _EXPORT = """examples:
@@ -511,21 +428,17 @@ world of the cameras.
 """
 
 
-def add_export(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `hands export`."""
+def _add_export(parser: argparse.ArgumentParser) -> None:
     parser.description = "Write the posed hand meshes of one frame for other programs."
     parser.epilog = _EXPORT
-    parser.add_argument("capture", type=Path, metavar="CAPTURE", help="capture folder")
-    parser.add_argument("out", type=Path, metavar="FILE", help="mesh file to write")
-    parser.add_argument("--frame", type=int, default=0, help="index of the frame (default 0)")
-    parser.add_argument(
-        "--truth", action="store_true", help="the true hands of a simulated capture"
-    )
+    add = parser.add_argument
+    add("capture", type=Path, metavar="CAPTURE", help="capture folder")
+    add("out", type=Path, metavar="FILE", help="mesh file to write")
+    add("--frame", type=int, default=0, help="index of the frame (default 0)")
+    add("--truth", action="store_true", help="the true hands of a simulated capture")
 
 
-def do_export(args: argparse.Namespace) -> int:
-    """Run `hands export`."""
-    from hwp_bench.base.files import check_places
+def _export(args: argparse.Namespace) -> int:
     from hwp_bench.capture import open_capture
     from hwp_bench.capture.convert import hand_meshes, write_meshes
 
@@ -539,13 +452,13 @@ def do_export(args: argparse.Namespace) -> int:
 
 #: The arguments and the work of each command, where `main` looks for them.
 COMMANDS = {
-    "check": (add_check, do_check),
-    "show": (add_show, do_show),
-    "audit": (add_audit, do_audit),
-    "get": (add_get, do_get),
-    "track": (add_track, do_track),
-    "inputs": (add_inputs, do_inputs),
-    "publish": (add_publish, do_publish),
-    "convert": (add_convert, do_convert),
-    "export": (add_export, do_export),
+    "check": (_add_check, _check),
+    "show": (_add_show, _show),
+    "audit": (_add_audit, _audit),
+    "get": (_add_get, _get),
+    "track": (_add_track, _track),
+    "inputs": (_add_inputs, _inputs),
+    "publish": (_add_publish, _publish),
+    "convert": (_add_convert, _convert),
+    "export": (_add_export, _export),
 }

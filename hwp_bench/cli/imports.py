@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hwp_bench.cli.options import add_force, add_json, print_json
+from hwp_bench.base.console import notice
+from hwp_bench.base.files import check_places
+from hwp_bench.cli.options import add_force, add_json, print_json, print_result
 
 if TYPE_CHECKING:
     from hwp_bench.importers.video import ImportedClip
@@ -24,73 +25,50 @@ frame of the video, image (F, 21, 2 or 3) in pixels, world (F, 21, 3) in metres 
 """
 
 
-def add_video(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `import video`."""
+def _add_video(parser: argparse.ArgumentParser) -> None:
     parser.description = "Make a capture of a video of hands and the landmarks tracked in it."
     parser.epilog = _VIDEO
-    parser.add_argument("video", type=Path, metavar="VIDEO", help="video file")
-    parser.add_argument("out", type=Path, metavar="OUT", help="capture folder to make")
-    parser.add_argument(
-        "--landmarks", type=Path, required=True, metavar="LANDMARKS.npz", help="tracked landmarks"
-    )
-    parser.add_argument(
-        "--side",
-        choices=("auto", "right", "left", "both"),
-        default="auto",
-        help="which hands (default: auto, one or both, as the landmarks and a fit to them show)",
-    )
+    add = parser.add_argument
+    add("video", type=Path, metavar="VIDEO", help="video file")
+    add("out", type=Path, metavar="OUT", help="capture folder to make")
+    landmarks = "tracked landmarks"
+    add("--landmarks", type=Path, required=True, metavar="LANDMARKS.npz", help=landmarks)
+    _add_side(parser, "one or both, as the landmarks and a fit to them show")
     # The name of the option until it took two hands.
-    parser.add_argument(
-        "--hand",
-        dest="side",
-        choices=("right", "left"),
-        default=argparse.SUPPRESS,
-        help=argparse.SUPPRESS,
-    )
-    parser.add_argument(
-        "--focal", type=float, metavar="PX", help="focal length of the whole frame; else estimated"
-    )
-    parser.add_argument(
-        "--masks", type=Path, metavar="DIR", help="your own masks, named by frame number"
-    )
-    parser.add_argument(
-        "--size", type=int, default=256, metavar="PX", help="edge of the frames (default: 256)"
-    )
-    parser.add_argument("--frames", metavar="A:B", help="only frames A to B-1")
-    parser.add_argument(
-        "--stride", type=int, default=1, metavar="K", help="every K-th frame (default: 1)"
-    )
-    parser.add_argument(
-        "--min-score",
-        type=float,
-        default=0.5,
-        metavar="S",
-        help="below this score a frame counts as without a hand (default: 0.5)",
-    )
-    parser.add_argument(
-        "--hand-model", default="anny", metavar="MODEL", help="anny (default) or mano:PATH"
-    )
-    parser.add_argument(
-        "--sheet", type=Path, metavar="PNG", help="write the overlay sheet here too"
-    )
-    parser.add_argument("--id", metavar="ID", help="capture id (default: the folder's name)")
-    parser.add_argument("--action", default="unknown", metavar="TEXT", help="what the hand does")
-    parser.add_argument("--device", default="unknown", metavar="TEXT", help="what recorded it")
-    parser.add_argument("--licence", default="unknown", metavar="TEXT", help="terms of use")
-    parser.add_argument(
-        "--perturbations",
-        default="",
-        metavar="NAMES",
-        help="perturbations in the clip, comma separated; their severities stay unknown",
-    )
+    hidden = argparse.SUPPRESS
+    add("--hand", dest="side", choices=("right", "left"), default=hidden, help=hidden)
+    focal = "focal length of the whole frame; else estimated"
+    add("--focal", type=float, metavar="PX", help=focal)
+    add("--masks", type=Path, metavar="DIR", help="your own masks, named by frame number")
+    _add_size(parser)
+    add("--frames", metavar="A:B", help="only frames A to B-1")
+    stride = "every K-th frame (default: 1)"
+    add("--stride", type=int, default=1, metavar="K", help=stride)
+    score = "below this score a frame counts as without a hand (default: 0.5)"
+    add("--min-score", type=float, default=0.5, metavar="S", help=score)
+    add("--hand-model", default="anny", metavar="MODEL", help="anny (default) or mano:PATH")
+    add("--sheet", type=Path, metavar="PNG", help="write the overlay sheet here too")
+    add("--id", metavar="ID", help="capture id (default: the folder's name)")
+    add("--action", default="unknown", metavar="TEXT", help="what the hand does")
+    add("--device", default="unknown", metavar="TEXT", help="what recorded it")
+    add("--licence", default="unknown", metavar="TEXT", help="terms of use")
+    names = "perturbations in the clip, comma separated; their severities stay unknown"
+    add("--perturbations", default="", metavar="NAMES", help=names)
     add_force(parser)
     add_json(parser, "print the numbers as JSON")
 
 
-def do_video(args: argparse.Namespace) -> int:
-    """Run `import video`."""
-    from hwp_bench.base.console import notice
-    from hwp_bench.base.files import check_places
+def _add_side(parser: argparse.ArgumentParser, auto: str) -> None:
+    sides, text = ("auto", "right", "left", "both"), f"which hands (default: auto, {auto})"
+    parser.add_argument("--side", choices=sides, default="auto", help=text)
+
+
+def _add_size(parser: argparse.ArgumentParser) -> None:
+    text = "edge of the frames (default: 256)"
+    parser.add_argument("--size", type=int, default=256, metavar="PX", help=text)
+
+
+def _video(args: argparse.Namespace) -> int:
     from hwp_bench.importers.video import (
         VideoImport,
         import_video,
@@ -101,27 +79,17 @@ def do_video(args: argparse.Namespace) -> int:
     inputs = {"VIDEO": args.video, "--landmarks": args.landmarks, "--masks": args.masks}
     outputs = {"OUT": args.out, "--sheet": args.sheet}
     check_places(outputs, inputs, replaces=args.force, makes_captures=True)
+    given = ("side", "focal", "masks", "size", "id", "action", "device", "licence", "hand_model")
     options = VideoImport(
-        side=args.side,
-        focal=args.focal,
-        masks=args.masks,
-        size=args.size,
+        **{name: getattr(args, name) for name in (*given, "min_score", "sheet")},
         frames=parse_frame_range(args.frames, args.stride),
-        id=args.id,
-        action=args.action,
-        device=args.device,
-        licence=args.licence,
         perturbations=tuple(name for name in args.perturbations.split(",") if name),
-        hand_model=args.hand_model,
-        min_score=args.min_score,
-        sheet=args.sheet,
         overwrite=args.force,
     )
     finished = read_finished_import(args.video, args.landmarks, args.out, options)
     if finished is not None:
         notice(f"{args.out} is complete: the same call has made it; --force imports again")
-        print(json.dumps(finished, indent=1) if args.json else f"capture: {args.out}")
-        return 0
+        return print_result(args.json, finished, [f"capture: {args.out}"])
     clip = import_video(args.video, args.landmarks, args.out, options)
     if args.json:
         print_json(clip.facts())
@@ -179,55 +147,39 @@ and its error is printed in mm. docs/data.md describes every step from the downl
 """
 
 
-def add_wildghand(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `import wildghand`."""
+def _add_out_and_mano(parser: argparse.ArgumentParser) -> None:
+    add, text = parser.add_argument, "your MANO files; without them the free hand is fitted"
+    add("-o", "--out", type=Path, required=True, metavar="OUT", help="capture folder to make")
+    add("--mano", type=Path, metavar="MANO_DIR", help=text)
+
+
+def _check_release_places(args: argparse.Namespace) -> None:
+    inputs = {"DIR": args.folder, "--mano": args.mano}
+    check_places({"--out": args.out}, inputs, replaces=args.force, makes_captures=True)
+
+
+def _add_wildghand(parser: argparse.ArgumentParser) -> None:
     parser.description = "Make captures of the official HWP release."
     parser.epilog = _WILDGHAND
-    parser.add_argument("folder", type=Path, metavar="DIR", help="folder of the release")
-    parser.add_argument(
-        "-o", "--out", type=Path, required=True, metavar="OUT", help="capture folder to make"
-    )
-    parser.add_argument(
-        "--mano",
-        type=Path,
-        metavar="MANO_DIR",
-        help="your MANO files; without them the free hand is fitted",
-    )
-    parser.add_argument(
-        "--official-compat",
-        action="store_true",
-        help="crop, intrinsics and translations as in the released loader",
-    )
-    parser.add_argument(
-        "--hand", choices=("right", "left"), help="the hand of a single-hand capture"
-    )
-    parser.add_argument("--id", metavar="ID", help="capture id (default: by the folder's name)")
-    parser.add_argument(
-        "--size", type=int, default=256, metavar="PX", help="edge of the frames (default: 256)"
-    )
-    parser.add_argument(
-        "--fps",
-        type=float,
-        default=30.0,
-        help="frame rate of the video before subsampling (default: 30)",
-    )
+    add = parser.add_argument
+    add("folder", type=Path, metavar="DIR", help="folder of the release")
+    _add_out_and_mano(parser)
+    compat = "crop, intrinsics and translations as in the released loader"
+    add("--official-compat", action="store_true", help=compat)
+    add("--hand", choices=("right", "left"), help="the hand of a single-hand capture")
+    add("--id", metavar="ID", help="capture id (default: by the folder's name)")
+    _add_size(parser)
+    fps = "frame rate of the video before subsampling (default: 30)"
+    add("--fps", type=float, default=30.0, help=fps)
     add_force(parser)
     add_json(parser, "print the facts as JSON")
 
 
-def do_wildghand(args: argparse.Namespace) -> int:
-    """Run `import wildghand`."""
-    from hwp_bench.base.console import notice
-    from hwp_bench.base.files import check_places
+def _wildghand(args: argparse.Namespace) -> int:
     from hwp_bench.importers.official import OfficialImport, import_official
     from hwp_bench.importers.official.records import find_folders
 
-    check_places(
-        {"--out": args.out},
-        {"DIR": args.folder, "--mano": args.mano},
-        replaces=args.force,
-        makes_captures=True,
-    )
+    _check_release_places(args)
     options = OfficialImport(
         mano=args.mano,
         official_compat=args.official_compat,
@@ -245,24 +197,19 @@ def do_wildghand(args: argparse.Namespace) -> int:
         for warning in facts["warnings"]:
             notice(f"warning: {folder.path}: {warning}")
         results.append({"out": str(out), **facts})
-    if args.json:
-        print_json(results)
-    else:
-        for facts in results:
-            _print_wildghand(facts)
-    return 0
+    return print_result(args.json, results, [line for r in results for line in _official_lines(r)])
 
 
-def _print_wildghand(facts: dict[str, Any]) -> None:
+def _official_lines(facts: dict[str, Any]) -> list[str]:
     valid = ", ".join(f"{side} in {count}" for side, count in facts["frames_valid"].items())
-    print(f"capture: {facts['out']}, {facts['frames']} frames, hands: {valid}")
-    for side, error in facts["vertex_error_mm"].items():
-        print(
-            f"{side} hand ({facts['hand_model']}): {error:.2f} mm from the tracker's vertices, "
-            f"joints {facts['joint_error_px'][side]:.2f} px from its joints, "
-            f"{100 * facts['vertices_on_mask'][side]:.0f} % of its vertices on the mask"
-        )
-    print(f"look at: {facts['out']}/extra/overlay.png")
+    errors = [
+        f"{side} hand ({facts['hand_model']}): {error:.2f} mm from the tracker's vertices, "
+        f"joints {facts['joint_error_px'][side]:.2f} px from its joints, "
+        f"{100 * facts['vertices_on_mask'][side]:.0f} % of its vertices on the mask"
+        for side, error in facts["vertex_error_mm"].items()
+    ]
+    first = f"capture: {facts['out']}, {facts['frames']} frames, hands: {valid}"
+    return [first, *errors, f"look at: {facts['out']}/extra/overlay.png"]
 
 
 _INTERHAND26M = """examples:
@@ -275,69 +222,41 @@ touchrom-16 and handscratch-16. The data set may not be used commercially (CC BY
 """
 
 
-def add_interhand26m(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `import interhand`."""
+def _add_interhand26m(parser: argparse.ArgumentParser) -> None:
     parser.description = "Make a capture of a sequence of InterHand2.6M."
     parser.epilog = _INTERHAND26M
-    parser.add_argument("folder", type=Path, metavar="DIR", help="folder of the data set")
-    parser.add_argument("sequence", metavar="SEQUENCE", help="a name, or CaptureN/SEQUENCE/camID")
-    parser.add_argument(
-        "-o", "--out", type=Path, required=True, metavar="OUT", help="capture folder to make"
-    )
-    parser.add_argument(
-        "--mano",
-        type=Path,
-        metavar="MANO_DIR",
-        help="your MANO files; without them the free hand is fitted",
-    )
-    parser.add_argument(
-        "--size", type=int, default=256, metavar="PX", help="edge of the frames (default: 256)"
-    )
-    parser.add_argument(
-        "--fps",
-        type=float,
-        default=5.0,
-        help="frame rate of the annotated frames, 5 or 30 (default: 5)",
-    )
-    parser.add_argument(
-        "--side",
-        choices=("auto", "right", "left", "both"),
-        default="auto",
-        help="which hands (default: auto, those that the sequence is said to show)",
-    )
+    add = parser.add_argument
+    add("folder", type=Path, metavar="DIR", help="folder of the data set")
+    add("sequence", metavar="SEQUENCE", help="a name, or CaptureN/SEQUENCE/camID")
+    _add_out_and_mano(parser)
+    _add_size(parser)
+    fps = "frame rate of the annotated frames, 5 or 30 (default: 5)"
+    add("--fps", type=float, default=5.0, help=fps)
+    _add_side(parser, "those that the sequence is said to show")
     add_force(parser)
     add_json(parser, "print the facts as JSON")
 
 
-def do_interhand26m(args: argparse.Namespace) -> int:
-    """Run `import interhand`."""
-    from hwp_bench.base.files import check_places
+def _interhand26m(args: argparse.Namespace) -> int:
     from hwp_bench.importers.interhand import InterHandImport, find_sequence, import_interhand
 
-    check_places(
-        {"--out": args.out},
-        {"DIR": args.folder, "--mano": args.mano},
-        replaces=args.force,
-        makes_captures=True,
-    )
+    _check_release_places(args)
     options = InterHandImport(
         mano=args.mano, size=args.size, fps=args.fps, side=args.side, overwrite=args.force
     )
     facts = import_interhand(args.folder, find_sequence(args.sequence), args.out, options)
-    if args.json:
-        print_json({"out": str(args.out), **facts})
-        return 0
-    print(f"capture: {args.out}, {facts['frames']} frames of {facts['split']}")
+    lines = [f"capture: {args.out}, {facts['frames']} frames of {facts['split']}"]
     for side, error in facts["errors"].items():
         joints = "unknown" if error["joints_mm"] is None else f"{error['joints_mm']:.2f} mm"
-        print(f"{side} hand: in {error['frames_valid']} frames, joints {joints} from the annotated")
-    print(f"look at: {args.out}/extra/overlay.png")
-    return 0
+        seen = f"in {error['frames_valid']} frames"
+        lines.append(f"{side} hand: {seen}, joints {joints} from the annotated")
+    lines.append(f"look at: {args.out}/extra/overlay.png")
+    return print_result(args.json, {"out": str(args.out), **facts}, lines)
 
 
 #: The arguments and the work of each command, where `main` looks for them.
 COMMANDS = {
-    "video": (add_video, do_video),
-    "wildghand": (add_wildghand, do_wildghand),
-    "interhand26m": (add_interhand26m, do_interhand26m),
+    "video": (_add_video, _video),
+    "wildghand": (_add_wildghand, _wildghand),
+    "interhand26m": (_add_interhand26m, _interhand26m),
 }

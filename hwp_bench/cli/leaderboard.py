@@ -4,10 +4,16 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from hwp_bench.cli.options import add_actions, add_json, captures_of, print_json
+from hwp_bench.base.console import notice
+from hwp_bench.base.errors import UsageError, has_odd_characters, shown
+from hwp_bench.base.files import check_places
+from hwp_bench.base.packages import data_folder
+from hwp_bench.base.tables import print_table, to_object
+from hwp_bench.cli.options import SEVERAL, add_actions, add_json, captures_of, print_json
 
 if TYPE_CHECKING:
     from hwp_bench.leaderboard.entries import Entry, Submission
@@ -95,104 +101,72 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     action = add_actions(parser)
     add = action("add", "write entries of results into the folder of entries", _add, _ADD)
     submit = action("submit", "make the folder of a pull request", _submit, _SUBMIT)
-    check = action(
-        "check", "check digests, protocol version, completeness of entries", _check, _CHECK
-    )
+    text = "check digests, protocol version, completeness of entries"
+    check = action("check", text, _check, _CHECK)
     show = action("show", "print the board: ranks with intervals, levels, badges", _show, _SHOW)
     confirm = action("confirm", "score an entry again, or compare a second run", _confirm, _CONFIRM)
-    register = action(
-        "register", "allow entries the names of methods that ship", _register, _REGISTER
-    )
+    text = "allow entries the names of methods that ship"
+    register = action("register", text, _register, _REGISTER)
     build = action("build", "write the static site", _build, _BUILD)
+    text = "folder of the entries (default leaderboard/entries)"
     for one in (add, submit, check, show, confirm, register, build):
-        one.add_argument(
-            "--entries", metavar="DIR", help="folder of the entries (default leaderboard/entries)"
-        )
+        one.add_argument("--entries", metavar="DIR", help=text)
+    text = "results folder or results.json"
     for taking in (add, submit):
-        taking.add_argument(
-            "results", nargs="+", metavar="RESULTS", help="results folder or results.json"
-        )
-    submit.add_argument(
-        "-o", "--out", required=True, metavar="FOLDER", help="new folder of the submission"
-    )
-    submit.add_argument("--by", default="", metavar="NAME", help="who stands for the rows")
-    submit.add_argument(
-        "--link",
-        action="append",
-        default=[],
-        metavar="KIND=URL",
-        help="https address of code, paper, predictions or avatars; may be repeated",
-    )
-    submit.add_argument(
-        "--avatars",
-        metavar="DIR",
-        help="fitted avatars, one file or folder for each capture id; only digests are noted",
-    )
-    submit.add_argument("--revises", metavar="ENTRY", help="name of the entry that is corrected")
-    submit.add_argument("--reason", default="", metavar="TEXT", help="why it is corrected")
-    add_json(submit, "print the entries as JSON")
-    check.add_argument(
-        "--against", metavar="DIR", help="entries before: none may be changed or removed"
-    )
+        taking.add_argument("results", nargs="+", metavar="RESULTS", help=text)
+    _add_submit(submit)
+    text = "entries before: none may be changed or removed"
+    check.add_argument("--against", metavar="DIR", help=text)
     add_json(check, "print the entries as JSON")
     show.add_argument("--suite", metavar="NAME", help="only the tables of this suite")
     add_json(show, "print the tables as JSON")
-    confirm.add_argument("results", metavar="RESULTS", help="results folder with predictions")
-    confirm.add_argument("--by", required=True, metavar="NAME", help="who checks")
-    confirm.add_argument("--entry", metavar="NAME", help="entry, where several fit")
-    confirm.add_argument(
-        "--tolerance",
-        type=float,
-        default=0.1,
-        metavar="DB",
-        help="largest difference of the macro mean of PSNR of a second run (default 0.1)",
-    )
-    confirm.add_argument(
-        "--captures",
-        nargs="+",
-        action="extend",
-        metavar="DIR",
-        help="captures (default: the result's suite)",
-    )
-    confirm.add_argument(
-        "--overrules",
-        action="append",
-        default=[],
-        metavar="CHECK",
-        help="digest (8 digits at least) of a check of the entry that no longer counts",
-    )
-    confirm.add_argument("--reason", default="", metavar="TEXT", help="why it does not count")
-    add_json(confirm, "print the check as JSON")
+    _add_confirm(confirm)
     register.add_argument("names", nargs="+", metavar="ENTRY", help="name of an entry")
     build.add_argument("-o", "--out", required=True, metavar="DIR", help="folder of the site")
-    build.add_argument(
-        "--with",
-        dest="folders",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="RESULTS",
-        help="results folders of entries, for the images of their reports",
+    text = "results folders of entries, for the images of their reports"
+    build.add_argument("--with", dest="folders", **SEVERAL, metavar="RESULTS", help=text)
+    text = (
+        "also copy pages of avatars (captures/ID/avatar.html in these folders) and lead to "
+        "them; they run the scripts of whoever made them"
     )
-    build.add_argument(
-        "--avatar-pages",
-        action="store_true",
-        help="also copy pages of avatars (captures/ID/avatar.html in these folders) and lead to "
-        "them; they run the scripts of whoever made them",
-    )
+    build.add_argument("--avatar-pages", action="store_true", help=text)
+
+
+def _add_submit(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("-o", "--out", required=True, metavar="FOLDER", help="new folder of the submission")
+    add("--by", default="", metavar="NAME", help="who stands for the rows")
+    text = "https address of code, paper, predictions or avatars; may be repeated"
+    add("--link", action="append", default=[], metavar="KIND=URL", help=text)
+    text = "fitted avatars, one file or folder for each capture id; only digests are noted"
+    add("--avatars", metavar="DIR", help=text)
+    add("--revises", metavar="ENTRY", help="name of the entry that is corrected")
+    add("--reason", default="", metavar="TEXT", help="why it is corrected")
+    add_json(parser, "print the entries as JSON")
+
+
+def _add_confirm(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("results", metavar="RESULTS", help="results folder with predictions")
+    add("--by", required=True, metavar="NAME", help="who checks")
+    add("--entry", metavar="NAME", help="entry, where several fit")
+    text = "largest difference of the macro mean of PSNR of a second run (default 0.1)"
+    add("--tolerance", type=float, default=0.1, metavar="DB", help=text)
+    add("--captures", **SEVERAL, metavar="DIR", help="captures (default: the result's suite)")
+    text = "digest (8 digits at least) of a check of the entry that no longer counts"
+    add("--overrules", action="append", default=[], metavar="CHECK", help=text)
+    add("--reason", default="", metavar="TEXT", help="why it does not count")
+    add_json(parser, "print the check as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
-    from hwp_bench.base.packages import data_folder
-
     folder = Path(args.entries) if args.entries else data_folder("leaderboard") / "entries"
     status: int = args.act(args, folder)
     return status
 
 
 def _add(args: argparse.Namespace, folder: Path) -> int:
-    from hwp_bench.base.console import notice
     from hwp_bench.leaderboard.soundness import check_source
     from hwp_bench.leaderboard.submit import add_entry
     from hwp_bench.results import read_results, results_among
@@ -205,8 +179,6 @@ def _add(args: argparse.Namespace, folder: Path) -> int:
 
 
 def _submit(args: argparse.Namespace, folder: Path) -> int:
-    from hwp_bench.base.console import notice
-    from hwp_bench.base.files import check_places
     from hwp_bench.leaderboard.soundness import check_source, sound_entries
     from hwp_bench.leaderboard.submit import TEXT, submit
     from hwp_bench.report.sources import read_sources, source_folders
@@ -218,24 +190,18 @@ def _submit(args: argparse.Namespace, folder: Path) -> int:
     check_places({"--out": args.out}, inputs)
     for file in results_among(args.results):
         check_source(file)
-    done = submit(
-        Path(args.out),
-        sources,
-        sound_entries(folder),
-        submission,
-        Path(args.avatars) if args.avatars else None,
-    )
-    for entry in done.entries:
-        there, count = done.predictions[entry.name]
+    out, avatars = Path(args.out), Path(args.avatars) if args.avatars else None
+    done = submit(out, sources, sound_entries(folder), submission, avatars)
+    for entry, there in done:
+        count = len(entry.results.captures)
         if there < count:
             notice(f"{entry.name}: predictions of {count - there} of {count} captures not at hand")
-    notice(f"submission: {done.folder}; text of the pull request: {done.folder / TEXT}")
-    _print_entries(done.entries, args.json)
+    notice(f"submission: {out}; text of the pull request: {out / TEXT}")
+    _print_entries([entry for entry, _ in done], args.json)
     return 0
 
 
 def _submission(args: argparse.Namespace) -> Submission:
-    from hwp_bench.base.errors import UsageError
     from hwp_bench.leaderboard.entries import Submission
 
     given = [("--by", args.by), ("--reason", args.reason), ("--revises", args.revises or "")]
@@ -252,8 +218,6 @@ def _submission(args: argparse.Namespace) -> Submission:
 
 def _check_line(option: str, text: str) -> None:
     """Refuse what an entry cannot hold: it would be written, and then not be read."""
-    from hwp_bench.base.errors import UsageError, has_odd_characters, shown
-
     if len(text) > _LINE or "\n" in text or has_odd_characters(text):
         raise UsageError(
             f"{shown(text[:60])!r} is not one line of at most {_LINE:,} characters without "
@@ -288,14 +252,9 @@ def _check(args: argparse.Namespace, folder: Path) -> int:
 
 
 def _show(args: argparse.Namespace, folder: Path) -> int:
-    from hwp_bench.base.errors import UsageError
-    from hwp_bench.base.tables import print_table, to_object
     from hwp_bench.leaderboard.board import board_tables
-    from hwp_bench.leaderboard.soundness import sound_entries
 
-    _refuse_none(folder)
-    entries = sound_entries(folder)
-    _refuse_unsound(folder, entries)
+    entries = _sound_entries(folder)
     chosen = [entry for entry in entries if args.suite in (None, entry.results.suite)]
     if args.suite and not chosen:
         raise UsageError(f"no entry is of the suite {args.suite!r}", field="--suite")
@@ -308,10 +267,6 @@ def _show(args: argparse.Namespace, folder: Path) -> int:
 
 
 def _confirm(args: argparse.Namespace, folder: Path) -> int:
-    from dataclasses import asdict
-
-    from hwp_bench.base.console import notice
-    from hwp_bench.base.errors import UsageError
     from hwp_bench.leaderboard.entries import refuse_installed, write_check
     from hwp_bench.leaderboard.soundness import readable_entries
     from hwp_bench.leaderboard.submit import confirm, entry_of
@@ -323,15 +278,14 @@ def _confirm(args: argparse.Namespace, folder: Path) -> int:
     (file,) = result_files(args.results)
     entries = readable_entries(folder)
     # Before a suite is rendered for it.
-    entry_of(entries, read_results(file), args.entry)
+    entry = entry_of(entries, read_results(file), args.entry)
     if not 0 <= args.tolerance <= 100:
         raise UsageError(f"{args.tolerance} is not between 0 and 100 dB", field="--tolerance")
     check = confirm(
-        entries,
+        entry,
         file,
         captures_of(args.captures, file),
         by=args.by,
-        name=args.entry,
         tolerance=args.tolerance,
         overrules=args.overrules,
         reason=args.reason,
@@ -339,19 +293,15 @@ def _confirm(args: argparse.Namespace, folder: Path) -> int:
     notice(f"check: {write_check(folder, check)}")
     if args.json:
         print_json(asdict(check))
-    else:
-        print(f"{check.entry}: {check.kind}, {check.verdict} ({check.frames} frames)")
-        if check.rerun:
-            print(
-                f"  second run {check.rerun[:8]}: PSNR {check.scores['psnr']:.2f} dB (macro mean)"
-            )
-            print(f"  captures with the same predictions: {check.same_predictions}")
+        return 0 if check.verdict == "reproduces" else 1
+    print(f"{check.entry}: {check.kind}, {check.verdict} ({check.frames} frames)")
+    if check.rerun:
+        print(f"  second run {check.rerun[:8]}: PSNR {check.scores['psnr']:.2f} dB (macro mean)")
+        print(f"  captures with the same predictions: {check.same_predictions}")
     return 0 if check.verdict == "reproduces" else 1
 
 
 def _register(args: argparse.Namespace, folder: Path) -> int:
-    from hwp_bench.base.console import notice
-    from hwp_bench.base.errors import UsageError
     from hwp_bench.leaderboard.entries import refuse_installed
     from hwp_bench.leaderboard.rules import NAME, register
     from hwp_bench.leaderboard.soundness import readable_entries
@@ -367,30 +317,20 @@ def _register(args: argparse.Namespace, folder: Path) -> int:
 
 
 def _build(args: argparse.Namespace, folder: Path) -> int:
-    from hwp_bench.base.console import notice
-    from hwp_bench.base.files import check_places
     from hwp_bench.leaderboard.site import build_site
-    from hwp_bench.leaderboard.soundness import sound_entries
     from hwp_bench.report.sources import read_sources, source_folders
 
     _refuse_none(folder)
     sources = read_sources(args.folders)
     check_places({"--out": args.out}, {"--with": source_folders(sources), "--entries": folder})
-    entries = sound_entries(folder)
-    _refuse_unsound(folder, entries)
-    page = build_site(
-        Path(args.out),
-        entries,
-        sources,
-        avatar_pages=args.avatar_pages,
-    )
+    entries = _sound_entries(folder)
+    page = build_site(Path(args.out), entries, sources, avatar_pages=args.avatar_pages)
     notice(f"site: {page}")
     return 0
 
 
 def _refuse_none(folder: Path) -> None:
     """Refuse a folder without entries: a wrong path must not look like a sound board."""
-    from hwp_bench.base.errors import UsageError
     from hwp_bench.leaderboard.entries import entry_files
 
     if not entry_files(folder):
@@ -400,10 +340,12 @@ def _refuse_none(folder: Path) -> None:
         )
 
 
-def _refuse_unsound(folder: Path, entries: Sequence[Entry]) -> None:
-    """Refuse a folder without a sound entry: its board would be empty."""
-    from hwp_bench.base.errors import UsageError
+def _sound_entries(folder: Path) -> list[Entry]:
+    """Read the sound entries of a folder; one without any is refused, as its board is empty."""
+    from hwp_bench.leaderboard.soundness import sound_entries
 
+    _refuse_none(folder)
+    entries = sound_entries(folder)
     if not entries:
         raise UsageError(
             "holds no sound entry",
@@ -412,31 +354,33 @@ def _refuse_unsound(folder: Path, entries: Sequence[Entry]) -> None:
             remedy="Name the folder of the entries; `hwp-bench leaderboard check` says what is "
             "wrong with a file.",
         )
+    return entries
 
 
 def _print_entries(entries: Sequence[Entry], as_json: bool) -> None:
-    if as_json:
-        print_json([_facts(entry) for entry in entries])
-
-
-def _facts(entry: Entry) -> dict[str, Any]:
-    return {
-        "entry": entry.name,
-        "digest": entry.digest,
-        "suite": entry.results.suite,
-        "protocol": entry.protocol,
-        "level": entry.level,
-        "badge": entry.badge,
-        "revises": entry.submission.revises,
-        "by": entry.submission.by,
-        "links": entry.submission.links,
-        "captures": [
-            {
-                "id": capture.id,
-                "data": capture.digest,
-                "predictions": capture.predictions_digest,
-                "avatar": entry.submission.avatars.get(capture.id),
-            }
-            for capture in entry.results.captures
-        ],
-    }
+    if not as_json:
+        return
+    facts = [
+        {
+            "entry": entry.name,
+            "digest": entry.digest,
+            "suite": entry.results.suite,
+            "protocol": entry.protocol,
+            "level": entry.level,
+            "badge": entry.badge,
+            "revises": entry.submission.revises,
+            "by": entry.submission.by,
+            "links": entry.submission.links,
+            "captures": [
+                {
+                    "id": capture.id,
+                    "data": capture.digest,
+                    "predictions": capture.predictions_digest,
+                    "avatar": entry.submission.avatars.get(capture.id),
+                }
+                for capture in entry.results.captures
+            ],
+        }
+        for entry in entries
+    ]
+    print_json(facts)

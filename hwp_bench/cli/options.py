@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from hwp_bench.base.errors import UsageError, has_odd_characters, shown
 from hwp_bench.base.records import parse_toml
+from hwp_bench.base.tables import Cell, Column, Table
 from hwp_bench.taxonomy import SUITES
 
 if TYPE_CHECKING:
@@ -32,6 +33,25 @@ def print_json(value: Any) -> None:
     print(json.dumps(value, indent=1))
 
 
+def print_result(as_json: bool, value: Any, lines: Iterable[str]) -> int:
+    """Print a value as JSON where that was asked for, else lines; returns the exit status, 0."""
+    if as_json:
+        print_json(value)
+    else:
+        print("\n".join(lines))
+    return 0
+
+
+def named_table(caption: str, titles: str, rows: Iterable[Sequence[Cell]]) -> Table:
+    """Return a table that ranks nothing; the titles of its columns are divided by commas."""
+    columns = tuple(Column(title) for title in titles.split(", "))
+    return Table(caption, columns, tuple(map(tuple, rows)), ranked=False)
+
+
+#: An option that takes several values and may be given again.
+SEVERAL: Mapping[str, Any] = {"nargs": "+", "action": "extend", "default": []}
+
+
 def add_results(parser: argparse.ArgumentParser, nargs: str = "+", more: str = "") -> None:
     """Add RESULTS, read by `report.sources.read_sources` or `results.read_all`."""
     text = f"results folder, results.json, or ablation folder{more}"
@@ -40,33 +60,22 @@ def add_results(parser: argparse.ArgumentParser, nargs: str = "+", more: str = "
 
 def add_capture_folders(parser: argparse.ArgumentParser, purpose: str) -> None:
     """Add `--captures`, for what results do not say of their captures."""
-    parser.add_argument(
-        "--captures",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="FOLDER",
-        help=f"capture folders, for {purpose} (simulated ones are found in the cache)",
-    )
+    text = f"capture folders, for {purpose} (simulated ones are found in the cache)"
+    parser.add_argument("--captures", **SEVERAL, metavar="FOLDER", help=text)
 
 
 def add_suite_or_captures(parser: argparse.ArgumentParser) -> None:
     """Add `--suite` and `--capture`, of which one can be given, and `--splits`."""
-    what = parser.add_mutually_exclusive_group()
-    what.add_argument(
-        "--suite",
-        choices=SUITES,
-        default="mini",
-        help="simulated captures, rendered on first use (default mini)",
-    )
-    what.add_argument(
-        "--capture",
-        nargs="+",
-        action="extend",
-        metavar="PATH",
-        help="capture folders, instead of a suite",
-    )
+    add = parser.add_mutually_exclusive_group().add_argument
+    text = "simulated captures, rendered on first use (default mini)"
+    add("--suite", choices=SUITES, default="mini", help=text)
+    add("--capture", **SEVERAL, metavar="PATH", help="capture folders, instead of a suite")
     add_splits(parser)
+
+
+def add_out(parser: argparse.ArgumentParser, text: str, metavar: str = "DIR") -> None:
+    """Add `-o`, which must be given."""
+    parser.add_argument("-o", "--out", type=Path, required=True, metavar=metavar, help=text)
 
 
 def add_splits(parser: argparse.ArgumentParser) -> None:

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from hwp_bench.base.console import notice, print_document, track
+from hwp_bench.base.errors import UsageError
+from hwp_bench.base.files import check_places
+from hwp_bench.base.tables import Table, format_table, print_table
 from hwp_bench.cli.options import (
+    SEVERAL,
     add_capture_folders,
     add_json,
     add_results,
     add_splits,
     captures_of,
+    named_table,
     print_json,
     splits_of,
 )
@@ -20,21 +27,8 @@ if TYPE_CHECKING:
     from hwp_bench.evaluation.verify import Verification
 
 _TABLES = (
-    "overall",
-    "rank",
-    "cost",
-    "captures",
-    "perturbations",
-    "details",
-    "micro",
-    "paper",
-    "robustness",
-    "severity",
-    "novelty",
-    "outline",
-    "free-view",
-    "bias",
-    "seeds",
+    *("overall", "rank", "cost", "captures", "perturbations", "details", "micro", "paper"),
+    *("robustness", "severity", "novelty", "outline", "free-view", "bias", "seeds"),
 )
 _TABLE = """examples:
   hwp-bench table runs/plain-mini
@@ -56,61 +50,41 @@ docs/tables.md says what each table shows and which command makes each table of 
 """
 
 
-def add_table(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `table`."""
+def _add_table(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _TABLE
     add_results(parser, "*")
-    which = parser.add_mutually_exclusive_group()
-    which.add_argument(
-        "--by", choices=_TABLES, default="overall", help="which table (default overall)"
+    which = parser.add_mutually_exclusive_group().add_argument
+    which("--by", choices=_TABLES, default="overall", help="which table (default overall)")
+    text = "the layout of the paper's table N, 1 to 10, in protocol paper-wildghand"
+    which("--paper", type=int, choices=range(1, 11), metavar="N", help=text)
+    add, text = (
+        parser.add_argument,
+        "append the paper's own numbers, marked as published on other data",
     )
-    which.add_argument(
-        "--paper",
-        type=int,
-        choices=range(1, 11),
-        metavar="N",
-        help="the layout of the paper's table N, 1 to 10, in protocol paper-wildghand",
-    )
-    parser.add_argument(
-        "--published",
-        action="store_true",
-        help="append the paper's own numbers, marked as published on other data",
-    )
-    parser.add_argument(
-        "--base", metavar="NAME", help="robustness: method that the gap is counted from"
-    )
+    add("--published", action="store_true", help=text)
+    add("--base", metavar="NAME", help="robustness: method that the gap is counted from")
     add_capture_folders(parser, "severities, novelty and outlines")
-    parser.add_argument(
-        "--format",
-        choices=("terminal", "md", "tex", "csv", "json"),
-        default="terminal",
-        help="format of the table (default terminal)",
-    )
+    forms = ("terminal", "md", "tex", "csv", "json")
+    text = "format of the table (default terminal)"
+    add("--format", choices=forms, default="terminal", help=text)
     add_json(parser, "the same as --format json")
 
 
-def do_table(args: argparse.Namespace) -> int:
-    """Run `table`."""
-    from hwp_bench.base.console import print_document
-    from hwp_bench.base.tables import format_table, print_table
+def _table(args: argparse.Namespace) -> int:
     from hwp_bench.report.requested_table import TableRequest, make_table
 
-    table = make_table(
-        TableRequest(
-            paths=args.results,
-            by=args.by,
-            paper=args.paper,
-            published=args.published,
-            base=args.base,
-            captures=args.captures,
-        )
+    request = TableRequest(
+        args.results, args.by, args.paper, args.published, args.base, args.captures
     )
-    form = "json" if args.json else args.format
+    _print_table(make_table(request), "json" if args.json else args.format)
+    return 0
+
+
+def _print_table(table: Table, form: str, end: str = "") -> None:
     if form == "terminal":
         print_table(table)
     else:
-        print_document(format_table(table, form))
-    return 0
+        print_document(format_table(table, form) + end)
 
 
 _COMPARE = """examples:
@@ -126,34 +100,21 @@ of training frames are refused (exit status 2).
 """
 
 
-def add_compare(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `compare`."""
+def _add_compare(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _COMPARE
     add_results(parser)
-    parser.add_argument(
-        "--metric",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="NAME",
-        help="metrics to compare (default: the headline metrics that all have)",
-    )
-    parser.add_argument("--resamples", type=int, default=10_000, help="default 10000")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the resampling")
-    parser.add_argument(
-        "--format",
-        choices=("terminal", "md", "tex", "csv"),
-        default="terminal",
-        help="format of the tables (default terminal)",
-    )
+    add = parser.add_argument
+    text = "metrics to compare (default: the headline metrics that all have)"
+    add("--metric", **SEVERAL, metavar="NAME", help=text)
+    add("--resamples", type=int, default=10_000, help="default 10000")
+    add("--seed", type=int, default=0, help="seed of the resampling")
+    forms, text = ("terminal", "md", "tex", "csv"), "format of the tables (default terminal)"
+    add("--format", choices=forms, default="terminal", help=text)
     add_json(parser, "print JSON with full precision")
 
 
-def do_compare(args: argparse.Namespace) -> int:
-    """Run `compare`."""
+def _compare(args: argparse.Namespace) -> int:
     from hwp_bench.analysis.compare import compare_results
-    from hwp_bench.base.console import print_document
-    from hwp_bench.base.tables import format_table, print_table
     from hwp_bench.report.tables import HEADLINE
     from hwp_bench.results import read_all
     from hwp_bench.results.schema import add_isolation_note
@@ -168,13 +129,8 @@ def do_compare(args: argparse.Namespace) -> int:
     )
     if args.json:
         print_json(comparison.as_dict())
-        return 0
-    for plain in comparison.tables():
-        table = add_isolation_note(plain, results)
-        if args.format == "terminal":
-            print_table(table)
-        else:
-            print_document(format_table(table, args.format) + "\n")
+    for table in () if args.json else comparison.tables():
+        _print_table(add_isolation_note(table, results), args.format, "\n")
     return 0
 
 
@@ -191,40 +147,23 @@ output folder. Results on different data are analysed apart: their tables say `D
 """
 
 
-def add_cost(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `cost`."""
+def _add_cost(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _COST
     add_results(parser, more="; seeds of a method go together")
-    parser.add_argument(
-        "--reference",
-        metavar="RESULTS",
-        help="result whose final score is a target (default: the plain baseline, if it is there)",
-    )
-    parser.add_argument("--metric", default="psnr", help="metric of the curves (default psnr)")
-    parser.add_argument(
-        "--budgets",
-        nargs="+",
-        type=float,
-        default=[5.0, 15.0, 60.0, 300.0],
-        metavar="SECONDS",
-        help="times at which scores are read (default 5 15 60 300, those that are reached)",
-    )
-    parser.add_argument(
-        "-o", "--out", default="hwp-cost", help="folder to write (default hwp-cost)"
-    )
+    add = parser.add_argument
+    text = "result whose final score is a target (default: the plain baseline, if it is there)"
+    add("--reference", metavar="RESULTS", help=text)
+    add("--metric", default="psnr", help="metric of the curves (default psnr)")
+    times, text = [5.0, 15.0, 60.0, 300.0], "times at which scores are read"
+    text += " (default 5 15 60 300, those that are reached)"
+    add("--budgets", nargs="+", type=float, default=times, metavar="SECONDS", help=text)
+    add("-o", "--out", default="hwp-cost", help="folder to write (default hwp-cost)")
     add_json(parser, "print JSON with the curves")
 
 
-def do_cost(args: argparse.Namespace) -> int:
-    """Run `cost`."""
-    from dataclasses import replace
-
+def _cost(args: argparse.Namespace) -> int:
     from hwp_bench.analysis.cost import CostAnalysis, analyse_cost
     from hwp_bench.analysis.pairing import group_runs
-    from hwp_bench.base.console import notice
-    from hwp_bench.base.errors import UsageError
-    from hwp_bench.base.files import check_places
-    from hwp_bench.base.tables import print_table
     from hwp_bench.metrics import metric
     from hwp_bench.report.figures import write_cost
     from hwp_bench.report.sources import (
@@ -250,35 +189,30 @@ def do_cost(args: argparse.Namespace) -> int:
     sources = read_sources(args.results, repeats=False)
     check_places({"--out": args.out}, {"RESULTS": source_folders(sources)})
     groups = data_groups(sources)
+    budgets = sorted(set(args.budgets))
     for group in groups:
         results = [source.results for source in group.sources]
         # With several groups a reference is only of the one that it shares its data with.
         fits = reference is None or data_key(reference.first) == data_key(results[0])
+        own = reference if fits or len(groups) == 1 else None
         try:
-            analysis = analyse_cost(
-                group_runs(results),
-                args.metric,
-                budgets=sorted(set(args.budgets)),
-                reference=reference if fits or len(groups) == 1 else None,
-            )
+            analysis = analyse_cost(group_runs(results), args.metric, budgets, own)
         except UsageError as error:
             if len(groups) == 1 or (group is groups[-1] and not found):
                 raise
             notice(f"left out, data {group.label}: {error}")
             continue
         found.append((group, analysis))
-        if not args.json:
-            if group.label:
-                print(f"Data {group.label}: {group.text}")
-            for table in analysis.tables.values():
-                head = f"Data {group.label}: " if group.label else ""
-                print_table(replace(table, caption=head + table.caption))
+        head = f"Data {group.label}: " if group.label else ""
+        if head and not args.json:
+            print(head + group.text)
+        for table in () if args.json else analysis.tables.values():
+            print_table(replace(table, caption=head + table.caption))
         for figure in write_cost(Path(args.out) / group.label, analysis):
             notice(f"figure: {figure}")
     if args.json:
-        several = {"groups": [{"data": g.label, "text": g.text, **a.as_object()} for g, a in found]}
-        whole = several if len(found) > 1 else found[0][1].as_object()
-        print_json(whole)
+        several = [{"data": g.label, "text": g.text, **a.as_object()} for g, a in found]
+        print_json({"groups": several} if len(found) > 1 else found[0][1].as_object())
     return 0
 
 
@@ -298,29 +232,22 @@ perturbation with intervals, a strip for every capture, images, environment and 
 """
 
 
-def add_report(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `report`."""
+def _add_report(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _REPORT
     add_results(parser)
-    parser.add_argument("-o", "--out", required=True, metavar="DIR", help="folder of the page")
+    add = parser.add_argument
+    add("-o", "--out", required=True, metavar="DIR", help="folder of the page")
     add_capture_folders(parser, "severities")
-    parser.add_argument(
-        "--base", metavar="NAME", help="method that shares of the gap are counted from"
+    add("--base", metavar="NAME", help="method that shares of the gap are counted from")
+    text = (
+        "lead to pages of avatars (captures/ID/avatar.html in a results folder); they run "
+        "the scripts of whoever made them"
     )
-    parser.add_argument(
-        "--avatar-pages",
-        action="store_true",
-        help="lead to pages of avatars (captures/ID/avatar.html in a results folder); they run "
-        "the scripts of whoever made them",
-    )
-    parser.add_argument("--title", help="heading of the page (default: the methods)")
+    add("--avatar-pages", action="store_true", help=text)
+    add("--title", help="heading of the page (default: the methods)")
 
 
-def do_report(args: argparse.Namespace) -> int:
-    """Run `report`."""
-
-    from hwp_bench.base.console import notice
-    from hwp_bench.base.files import check_places
+def _report(args: argparse.Namespace) -> int:
     from hwp_bench.report.page import write_reports
     from hwp_bench.report.sources import read_sources, source_folders
 
@@ -353,56 +280,43 @@ scikit-image. Exit status 0: everything is as the result says; 1: something diff
 _SHOWN = 20
 
 
-def add_verify(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `verify`."""
+def _add_verify(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _VERIFY
     add_results(parser)
-    parser.add_argument(
-        "--captures",
-        nargs="+",
-        action="extend",
-        metavar="DIR",
-        help="captures, or folders of captures (default: the result's suite)",
-    )
+    text = "captures, or folders of captures (default: the result's suite)"
+    parser.add_argument("--captures", **SEVERAL, metavar="DIR", help=text)
     add_splits(parser)
     add_json(parser)
 
 
-def do_verify(args: argparse.Namespace) -> int:
-    """Run `verify`."""
-    from dataclasses import asdict
-
-    from hwp_bench.base.console import track
+def _verify(args: argparse.Namespace) -> int:
     from hwp_bench.evaluation.verify import verify_results
     from hwp_bench.results import result_files
 
     splits = splits_of(args)
     files = [file for path in args.results for file in result_files(path)]
-    outcomes = []
-    for file in track(files, "verify"):
-        outcomes.append(verify_results(file, captures_of(args.captures, file), splits))
+    outcomes = [
+        verify_results(file, captures_of(args.captures, file), splits)
+        for file in track(files, "verify")
+    ]
     if args.json:
         print_json([asdict(outcome) for outcome in outcomes])
-    else:
-        for outcome in outcomes:
-            _print_verify(outcome)
+    for outcome in () if args.json else outcomes:
+        _print_verify(outcome)
     return 1 if any(outcome.discrepancies for outcome in outcomes) else 0
 
 
 def _print_verify(outcome: Verification) -> None:
-    from hwp_bench.base.tables import Column, Table, print_table
-
-    shown = outcome.discrepancies[:_SHOWN]
-    if shown:
-        titles = ("capture", "what", "the result says", "found")
-        rows = tuple((d.capture or "all", d.what, d.recorded, d.found) for d in shown)
-        print_table(Table(outcome.file, tuple(map(Column, titles)), rows, ranked=False))
-        rest = len(outcome.discrepancies) - len(shown)
-        if rest:
-            print(f"and {rest} more")
-    verdict = f"{len(outcome.discrepancies)} differences" if shown else "holds"
+    count = len(outcome.discrepancies)
+    if count:
+        shown = outcome.discrepancies[:_SHOWN]
+        rows = [(d.capture or "all", d.what, d.recorded, d.found) for d in shown]
+        print_table(named_table(outcome.file, "capture, what, the result says, found", rows))
+    if count > _SHOWN:
+        print(f"and {count - _SHOWN} more")
+    verdict = f"{count} differences" if count else "holds"
     print(f"{outcome.file}: {verdict} ({outcome.captures} captures, {outcome.frames} frames)")
-    if outcome.cross_checked and not shown:
+    if outcome.cross_checked and not count:
         print(f"  scikit-image agrees on PSNR and SSIM of {outcome.cross_checked} frames")
     for note in outcome.notes:
         print(f"  {note}")
@@ -410,9 +324,9 @@ def _print_verify(outcome: Verification) -> None:
 
 #: The arguments and the work of each command, where `main` looks for them.
 COMMANDS = {
-    "table": (add_table, do_table),
-    "compare": (add_compare, do_compare),
-    "cost": (add_cost, do_cost),
-    "report": (add_report, do_report),
-    "verify": (add_verify, do_verify),
+    "table": (_add_table, _table),
+    "compare": (_add_compare, _compare),
+    "cost": (_add_cost, _cost),
+    "report": (_add_report, _report),
+    "verify": (_add_verify, _verify),
 }

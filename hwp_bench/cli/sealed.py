@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hwp_bench.cli.options import add_actions, add_json, print_json
-from hwp_bench.run.engine.options import add_engine_arguments
+from hwp_bench.base.errors import UsageError
+from hwp_bench.base.files import check_places
+from hwp_bench.cli.options import add_actions, add_json, print_json, print_result
+from hwp_bench.run.engine.options import add_engine_arguments, engine_for, needs_of
 from hwp_bench.taxonomy import SUITES
 
 if TYPE_CHECKING:
@@ -54,39 +57,35 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.epilog = _EXAMPLES
     action = add_actions(parser)
-    make = action(
-        "make", "draw a secret, render a suite from it, divide it into parts", _make, _MAKE
-    )
-    make.add_argument("scenes", nargs="*", metavar="SCENE", help="scenes that come along")
-    make.add_argument("--suite", choices=SUITES, help="the scenes, frames and size of a suite")
-    make.add_argument("-o", "--out", required=True, metavar="DIR", help="folder of the suite")
-    make.add_argument("--frames", type=int, help="frames of each capture (default 60)")
-    make.add_argument("--size", type=int, help="edge of the images in pixels (default 176)")
-    make.add_argument("--secret", metavar="FILE", help="file of a secret (default: draw one)")
-    make.add_argument("--workers", type=int, help="processes (default: as many as are worth it)")
+    text = "draw a secret, render a suite from it, divide it into parts"
+    make = action("make", text, _make, _MAKE)
+    reveal = action("reveal", "write the file that reveals a suite's secret", _reveal, _REVEAL)
+    text = "make the captures of a revealed suite again and compare"
+    check = action("check", text, _check, _CHECK)
+    workers = "processes (default: as many as are worth it)"
+
+    add = make.add_argument
+    add("scenes", nargs="*", metavar="SCENE", help="scenes that come along")
+    add("--suite", choices=SUITES, help="the scenes, frames and size of a suite")
+    add("-o", "--out", required=True, metavar="DIR", help="folder of the suite")
+    add("--frames", type=int, help="frames of each capture (default 60)")
+    add("--size", type=int, help="edge of the images in pixels (default 176)")
+    add("--secret", metavar="FILE", help="file of a secret (default: draw one)")
+    add("--workers", type=int, help=workers)
     add_json(make, "print what was made as JSON")
     add_engine_arguments(make)
-    reveal = action("reveal", "write the file that reveals a suite's secret", _reveal, _REVEAL)
+
     reveal.add_argument("suite", metavar="SUITE", help="folder that `make` made")
     reveal.add_argument("-o", "--out", required=True, metavar="FILE", help="file to write")
-    check = action(
-        "check", "make the captures of a revealed suite again and compare", _check, _CHECK
-    )
-    check.add_argument("public", metavar="PUBLIC", help="the published part for authors")
-    check.add_argument("revealed", metavar="REVEALED", help="the file that reveals the secret")
-    check.add_argument(
-        "--work", default="revealed-captures", metavar="DIR", help="folder of the new captures"
-    )
-    which = check.add_mutually_exclusive_group()
-    which.add_argument(
-        "--capture",
-        nargs="+",
-        action="extend",
-        metavar="ID",
-        help="captures to make again (default: all)",
-    )
+
+    add = check.add_argument
+    add("public", metavar="PUBLIC", help="the published part for authors")
+    add("revealed", metavar="REVEALED", help="the file that reveals the secret")
+    add("--work", default="revealed-captures", metavar="DIR", help="folder of the new captures")
+    which, text = check.add_mutually_exclusive_group(), "captures to make again (default: all)"
+    which.add_argument("--capture", nargs="+", action="extend", metavar="ID", help=text)
     which.add_argument("--no-render", action="store_true", help="compare the commitments alone")
-    check.add_argument("--workers", type=int, help="processes (default: as many as are worth it)")
+    add("--workers", type=int, help=workers)
     add_json(check, "print what was compared as JSON")
 
 
@@ -97,10 +96,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _make(args: argparse.Namespace) -> int:
-    from hwp_bench.base.files import check_places
     from hwp_bench.commitments import make_suite
     from hwp_bench.commitments.recipe import read_secret
-    from hwp_bench.run.engine.options import engine_for, needs_of
 
     check_places({"--out": args.out}, {"--secret": args.secret})
     recipe = _recipe(args)
@@ -114,22 +111,18 @@ def _make(args: argparse.Namespace) -> int:
             engine=engine,
             needs=needs_of(args),
         )
-    lines = {
+    facts = {
         "for authors": str(made.public),
         "keep secret": str(made.sealed),
         "the secret": str(made.secret),
         "commitment to the secret": made.page.secret_commitment,
         "commitment to the frames": made.page.frames_commitment,
     }
-    if args.json:
-        print_json({name.replace(" ", "_"): text for name, text in lines.items()})
-    else:
-        print("\n".join(f"{name}: {text}" for name, text in lines.items()))
-    return 0
+    value = {name.replace(" ", "_"): text for name, text in facts.items()}
+    return print_result(args.json, value, [f"{name}: {text}" for name, text in facts.items()])
 
 
 def _recipe(args: argparse.Namespace) -> Recipe:
-    from hwp_bench.base.errors import UsageError
     from hwp_bench.commitments.recipe import recipe_of, suite_recipe
 
     if (args.suite is None) == (not args.scenes):
@@ -142,7 +135,6 @@ def _recipe(args: argparse.Namespace) -> Recipe:
 
 
 def _reveal(args: argparse.Namespace) -> int:
-    from hwp_bench.base.files import check_places
     from hwp_bench.commitments import reveal
 
     check_places({"--out": args.out}, {"SUITE": args.suite})
@@ -152,27 +144,25 @@ def _reveal(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace) -> int:
-    from dataclasses import asdict
-
-    from hwp_bench.base.files import check_places
     from hwp_bench.commitments import check_revealed
 
     check_places({"--work": args.work}, {"PUBLIC": args.public, "REVEALED": args.revealed})
     only = () if args.no_render else args.capture
     found = check_revealed(args.public, args.revealed, args.work, only=only, workers=args.workers)
+    status = 0 if found.holds else 1
     if args.json:
         rows = [{**asdict(capture), "same": capture.same} for capture in found.captures]
         page = {"secret_commitment": found.page.secret_commitment, "holds": found.holds}
         print_json({**page, "captures": rows})
-        return 0 if found.holds else 1
+        return status
     print(f"the secret is the one that was committed to: {found.page.secret_commitment}")
     for capture in found.captures:
-        if capture.same:
-            print(f"{capture.id}: as committed to")
-            continue
-        hidden = "as committed to" if capture.hidden else "others than committed to"
-        print(
-            f"{capture.id}: differs: test frames {hidden}, {capture.different} training images "
-            f"differ by at most {capture.levels} of 255"
-        )
-    return 0 if found.holds else 1
+        text = "as committed to"
+        if not capture.same:
+            hidden = "as committed to" if capture.hidden else "others than committed to"
+            text = (
+                f"differs: test frames {hidden}, {capture.different} training images "
+                f"differ by at most {capture.levels} of 255"
+            )
+        print(f"{capture.id}: {text}")
+    return status

@@ -28,11 +28,58 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.epilog = _EXAMPLES
     action = add_actions(parser)
-    _add_list(action("list", "list scenes, suites, objects and effects"))
-    _add_plan(action("plan", "print what a scene's frames need and will cost"))
-    _add_render(action("render", "render captures"))
-    _add_preview(action("preview", "contact sheet and animation of a scene"))
-    _add_calibrate(action("calibrate", "solve strengths for stated losses"))
+    add_json(action("list", "list scenes, suites, objects and effects"))
+    scenes = "scene names, files, all, or a wild suite"
+
+    plan = action("plan", "print what a scene's frames need and will cost")
+    plan.add_argument("scene", metavar="SCENE", nargs="+", help=scenes)
+    _add_extent(plan)
+    text = "count passes only, render no probe for the cost"
+    plan.add_argument("--no-probe", action="store_true", help=text)
+    add_json(plan)
+
+    render = action("render", "render captures")
+    add, text = render.add_argument, "scene name or file, all, or a wild suite"
+    add("scene", metavar="SCENE", nargs="?", help=text)
+    add("-o", "--out", help="folder to make; for all and for suites their parent")
+    add("--suite", choices=SUITES, help="render a suite")
+    _add_extent(render)
+    _add_variation(render)
+    add("--seed", type=int, help="another seed of everything random")
+    add("--workers", type=int, help="processes (default: as many as are worth it)")
+    add("--exr", action="store_true", help="also linear EXR with extra layers")
+    text = "without the clip of unseen poses from cameras all around"
+    add("--no-free-view", dest="free_view", action="store_false", help=text)
+    add("--overwrite", action="store_true", help="replace what exists")
+    add_engine_arguments(render)
+
+    preview = action("preview", "contact sheet and animation of a scene")
+    add = preview.add_argument
+    add("scene", metavar="SCENE", help="scene name or file")
+    add("-o", "--out", default=".", help="folder (default: here)")
+    add("--frames", type=int, default=48, help="frames (default 48)")
+    add("--size", type=int, default=160, help="edge in pixels (default 160)")
+    _add_variation(preview)
+    text = "draw hand, objects, light and camera in 3D instead"
+    add("--stage", action="store_true", help=text)
+
+    calibrate = action("calibrate", "solve strengths for stated losses")
+    add = calibrate.add_argument
+    add("scene", metavar="SCENE", nargs="+", help=scenes)
+    add("--effect", metavar="KIND", help="only this effect")
+    add("--write", action="store_true", help="write strengths into the files")
+    add_json(calibrate)
+
+
+def _add_extent(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--frames", type=int, help="frames (default: the scene's own)")
+    parser.add_argument("--size", type=int, help="edge of the image in pixels (default 256)")
+
+
+def _add_variation(parser: argparse.ArgumentParser) -> None:
+    severity = "one severity, 1-5, for every episode"
+    parser.add_argument("--severity", type=float, help=severity)
+    parser.add_argument("--subject", type=int, metavar="SEED", help="another person")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -47,66 +94,3 @@ def run(args: argparse.Namespace) -> int:
         "calibrate": commands.calibrate_scenes,
     }[args.action]
     return action(args)
-
-
-def _add_list(parser: argparse.ArgumentParser) -> None:
-    add_json(parser)
-
-
-def _add_plan(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "scene", metavar="SCENE", nargs="+", help="scene names, files, all, or a wild suite"
-    )
-    _add_extent(parser)
-    parser.add_argument(
-        "--no-probe", action="store_true", help="count passes only, render no probe for the cost"
-    )
-    add_json(parser)
-
-
-def _add_render(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "scene", metavar="SCENE", nargs="?", help="scene name or file, all, or a wild suite"
-    )
-    parser.add_argument("-o", "--out", help="folder to make; for all and for suites their parent")
-    parser.add_argument("--suite", choices=SUITES, help="render a suite")
-    _add_extent(parser)
-    parser.add_argument("--severity", type=float, help="one severity, 1-5, for every episode")
-    parser.add_argument("--subject", type=int, metavar="SEED", help="another person")
-    parser.add_argument("--seed", type=int, help="another seed of everything random")
-    parser.add_argument("--workers", type=int, help="processes (default: as many as are worth it)")
-    parser.add_argument("--exr", action="store_true", help="also linear EXR with extra layers")
-    parser.add_argument(
-        "--no-free-view",
-        dest="free_view",
-        action="store_false",
-        help="without the clip of unseen poses from cameras all around",
-    )
-    parser.add_argument("--overwrite", action="store_true", help="replace what exists")
-    add_engine_arguments(parser)
-
-
-def _add_preview(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("scene", metavar="SCENE", help="scene name or file")
-    parser.add_argument("-o", "--out", default=".", help="folder (default: here)")
-    parser.add_argument("--frames", type=int, default=48, help="frames (default 48)")
-    parser.add_argument("--size", type=int, default=160, help="edge in pixels (default 160)")
-    parser.add_argument("--severity", type=float, help="one severity, 1-5, for every episode")
-    parser.add_argument("--subject", type=int, metavar="SEED", help="another person")
-    parser.add_argument(
-        "--stage", action="store_true", help="draw hand, objects, light and camera in 3D instead"
-    )
-
-
-def _add_calibrate(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "scene", metavar="SCENE", nargs="+", help="scene names, files, all, or a wild suite"
-    )
-    parser.add_argument("--effect", metavar="KIND", help="only this effect")
-    parser.add_argument("--write", action="store_true", help="write strengths into the files")
-    add_json(parser)
-
-
-def _add_extent(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--frames", type=int, help="frames (default: the scene's own)")
-    parser.add_argument("--size", type=int, help="edge of the image in pixels (default 256)")

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from hwp_bench.cli.options import add_json, print_json
+from hwp_bench.base.console import notice
+from hwp_bench.base.errors import UsageError
+from hwp_bench.base.tables import Table, print_table, to_object
+from hwp_bench.cli.options import add_json, named_table, print_json
 from hwp_bench.cli.program import add_shell_argument, completion_script
+from hwp_bench.taxonomy import PERTURBATIONS, SUITES, catalogue, perturbation
 
 if TYPE_CHECKING:
-    from hwp_bench.base.tables import Table
-    from hwp_bench.stability import Case, CaseOutcome
-
-_TOPICS = ("captures", "perturbations", "suites", "methods", "metrics")
+    from hwp_bench.stability import Case
 
 _LIST = """examples:
   hwp-bench list
@@ -21,97 +22,57 @@ _LIST = """examples:
 """
 
 
-def add_list(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `list`."""
+def _add_list(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _LIST
-    parser.add_argument(
-        "topic", nargs="?", choices=_TOPICS, help="what to list (default: everything)"
-    )
+    text = "what to list (default: everything)"
+    parser.add_argument("topic", nargs="?", choices=tuple(_TOPICS), help=text)
     add_json(parser)
 
 
-def do_list(args: argparse.Namespace) -> int:
-    """Run `list`."""
-    from hwp_bench.base.tables import print_table, to_object
-
-    makers = {
-        "captures": _captures,
-        "perturbations": _perturbations,
-        "suites": _suites,
-        "methods": _methods,
-        "metrics": _metrics,
-    }
-    tables = {topic: makers[topic]() for topic in ([args.topic] if args.topic else _TOPICS)}
+def _list(args: argparse.Namespace) -> int:
+    tables = {topic: _TOPICS[topic]() for topic in ([args.topic] if args.topic else _TOPICS)}
     if args.json:
-        value = {topic: to_object(table)["rows"] for topic, table in tables.items()}
-        print_json(value)
-    else:
-        for table in tables.values():
-            print_table(table)
+        print_json({topic: to_object(table)["rows"] for topic, table in tables.items()})
+    for table in () if args.json else tables.values():
+        print_table(table)
     return 0
 
 
 def _captures() -> Table:
-    from hwp_bench.base.tables import Column, Table
-    from hwp_bench.taxonomy import catalogue
-
-    columns = ("capture", "hands", "action", "device", "frames", "perturbations")
-    rows = tuple(
-        (
-            entry.id,
-            entry.hands,
-            entry.action,
-            entry.device,
-            entry.frame_count,
-            ", ".join(entry.perturbations),
-        )
-        for entry in catalogue().values()
-    )
-    return Table("Captures of the HWP data set", tuple(map(Column, columns)), rows)
+    rows = [
+        (one.id, one.hands, one.action, one.device, one.frame_count, ", ".join(one.perturbations))
+        for one in catalogue().values()
+    ]
+    titles = "capture, hands, action, device, frames, perturbations"
+    return named_table("Captures of the HWP data set", titles, rows)
 
 
 def _perturbations() -> Table:
-    from hwp_bench.base.tables import Column, Table
-    from hwp_bench.taxonomy import PERTURBATIONS, catalogue, perturbation
-
-    rows = tuple(
-        (
-            name,
-            perturbation(name).description,
-            sum(name in entry.perturbations for entry in catalogue().values()),
-        )
+    counts = {
+        name: sum(name in entry.perturbations for entry in catalogue().values())
         for name in PERTURBATIONS
-    )
-    columns = (Column("perturbation"), Column("what it does"), Column("captures"))
-    return Table("Perturbations", columns, rows)
+    }
+    rows = [(name, perturbation(name).description, count) for name, count in counts.items()]
+    return named_table("Perturbations", "perturbation, what it does, captures", rows)
 
 
 def _suites() -> Table:
-    from hwp_bench.base.tables import Column, Table
     from hwp_bench.sim import suite
-    from hwp_bench.taxonomy import SUITES
 
     rows = []
     for name in SUITES:
         items = suite(name)
-        rows.append(
-            (
-                name,
-                len(items),
-                sum(item.frame_count for item in items),
-                f"{items[0].size} px",
-                ", ".join(item.scene.id for item in items),
-            )
-        )
-    columns = ("suite", "captures", "frames", "size", "which")
-    return Table("Suites of simulated captures", tuple(map(Column, columns)), tuple(rows))
+        frames = sum(item.frame_count for item in items)
+        which = ", ".join(item.scene.id for item in items)
+        rows.append((name, len(items), frames, f"{items[0].size} px", which))
+    titles = "suite, captures, frames, size, which"
+    return named_table("Suites of simulated captures", titles, rows)
 
 
 def _methods() -> Table:
-    from hwp_bench.base.tables import Column, Table
     from hwp_bench.methods.manifest import shipped_methods
 
-    rows = tuple(
+    rows = [
         (
             method.name,
             method.title,
@@ -123,16 +84,15 @@ def _methods() -> Table:
             method.description,
         )
         for method in shipped_methods()
-    )
-    names = ["method", "title", "presets", "switches", "authors", "licence", "url", "description"]
-    return Table("Methods that ship with the toolkit", tuple(map(Column, names)), rows)
+    ]
+    titles = "method, title, presets, switches, authors, licence, url, description"
+    return named_table("Methods that ship with the toolkit", titles, rows)
 
 
 def _metrics() -> Table:
-    from hwp_bench.base.tables import Column, Table
     from hwp_bench.metrics import METRICS
 
-    rows = tuple(
+    rows = [
         (
             metric.name,
             metric.protocol,
@@ -142,10 +102,17 @@ def _metrics() -> Table:
             f"{metric.description} [{metric.reference}]",
         )
         for metric in METRICS
-    )
-    columns = ("metric", "protocol", "unit", "better", "penalty", "what it measures")
-    return Table("Metrics", tuple(map(Column, columns)), rows)
+    ]
+    return named_table("Metrics", "metric, protocol, unit, better, penalty, what it measures", rows)
 
+
+_TOPICS = {
+    "captures": _captures,
+    "perturbations": _perturbations,
+    "suites": _suites,
+    "methods": _methods,
+    "metrics": _metrics,
+}
 
 _STABILITY = """examples:
   hwp-bench stability
@@ -154,36 +121,27 @@ _STABILITY = """examples:
 """
 
 
-def add_stability(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `stability`."""
+def _add_stability(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _STABILITY
-    parser.add_argument(
-        "--backend",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="only on this backend (may be repeated; default: every one that this machine has)",
-    )
-    parser.add_argument(
-        "--group",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="only this part of the product (may be repeated; default: all)",
-    )
-    parser.add_argument(
-        "--provider",
-        action="append",
-        default=[],
-        metavar="MODULE:FUNCTION",
-        help="more cases, besides those of installed packages (may be repeated)",
-    )
+    more = "may be repeated"
+    for option, name, text in (
+        (
+            "backend",
+            "NAME",
+            f"only on this backend ({more}; default: every one that this machine has)",
+        ),
+        ("group", "NAME", f"only this part of the product ({more}; default: all)"),
+        (
+            "provider",
+            "MODULE:FUNCTION",
+            f"more cases, besides those of installed packages ({more})",
+        ),
+    ):
+        parser.add_argument(f"--{option}", action="append", default=[], metavar=name, help=text)
     add_json(parser)
 
 
-def do_stability(args: argparse.Namespace) -> int:
-    """Run `stability`; 1 if anything that must hold does not."""
-    from hwp_bench.base.console import notice
+def _stability(args: argparse.Namespace) -> int:
     from hwp_bench.stability import find_cases, run_cases
 
     cases = find_cases(args.group, args.provider)
@@ -193,16 +151,39 @@ def do_stability(args: argparse.Namespace) -> int:
         outcomes.append(outcome)
         if not outcome.measured.passed:
             notice(f"failed: {outcome.case.name}: {outcome.measured.text}")
+    passed = sum(outcome.measured.passed for outcome in outcomes)
     if args.json:
-        print_json([_as_object(outcome) for outcome in outcomes])
+        facts = [
+            {
+                "group": one.case.group,
+                "case": one.case.name,
+                "backend": one.backend,
+                "must_hold": one.case.must_hold,
+                "measured": one.measured.text,
+                "passed": one.measured.passed,
+                "seconds": round(one.seconds, 4),
+            }
+            for one in outcomes
+        ]
+        print_json(facts)
     else:
-        _print_stability(outcomes)
-    return 0 if all(outcome.measured.passed for outcome in outcomes) else 1
+        rows = [
+            (
+                f"{one.case.group}: {one.case.name}",
+                one.backend,
+                one.case.must_hold,
+                one.measured.text,
+                "yes" if one.measured.passed else "NO",
+            )
+            for one in outcomes
+        ]
+        titles = "case, backend, what must hold, measured, pass"
+        print_table(named_table("Numerical hard cases", titles, rows))
+        print(f"{passed} of {len(outcomes)} passed")
+    return 0 if passed == len(outcomes) else 1
 
 
 def _check_backends(cases: list[Case], asked: list[str]) -> None:
-    from hwp_bench.base.errors import UsageError
-
     known = sorted({name for case in cases for name in case.backends if name})
     for name in asked:
         if name not in known:
@@ -213,44 +194,11 @@ def _check_backends(cases: list[Case], asked: list[str]) -> None:
             )
 
 
-def _as_object(outcome: CaseOutcome) -> dict[str, Any]:
-    return {
-        "group": outcome.case.group,
-        "case": outcome.case.name,
-        "backend": outcome.backend,
-        "must_hold": outcome.case.must_hold,
-        "measured": outcome.measured.text,
-        "passed": outcome.measured.passed,
-        "seconds": round(outcome.seconds, 4),
-    }
-
-
-def _print_stability(outcomes: list[CaseOutcome]) -> None:
-    from hwp_bench.base.tables import Column, Table, print_table
-
-    titles = ("case", "backend", "what must hold", "measured", "pass")
-    rows = tuple(
-        (
-            f"{outcome.case.group}: {outcome.case.name}",
-            outcome.backend,
-            outcome.case.must_hold,
-            outcome.measured.text,
-            "yes" if outcome.measured.passed else "NO",
-        )
-        for outcome in outcomes
-    )
-    print_table(Table("Numerical hard cases", tuple(Column(title) for title in titles), rows))
-    passed = sum(outcome.measured.passed for outcome in outcomes)
-    print(f"{passed} of {len(outcomes)} passed")
-
-
-def add_completion(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `completion`."""
+def _add_completion(parser: argparse.ArgumentParser) -> None:
     add_shell_argument(parser, "hwp-bench")
 
 
-def do_completion(args: argparse.Namespace) -> int:
-    """Run `completion`."""
+def _completion(args: argparse.Namespace) -> int:
     from hwp_bench.cli.main import command_tree
 
     print(completion_script("hwp-bench", command_tree(), args.shell))
@@ -259,7 +207,7 @@ def do_completion(args: argparse.Namespace) -> int:
 
 #: The arguments and the work of each command, where `main` looks for them.
 COMMANDS = {
-    "list": (add_list, do_list),
-    "stability": (add_stability, do_stability),
-    "completion": (add_completion, do_completion),
+    "list": (_add_list, _list),
+    "stability": (_add_stability, _stability),
+    "completion": (_add_completion, _completion),
 }

@@ -99,7 +99,6 @@ class Publication:
     sealed: Path
     #: Digest of all commitments (hex), as the public manifest holds it.
     commitment: str
-    #: Ids of the captures.
     captures: tuple[str, ...]
 
 
@@ -121,16 +120,8 @@ def publish(
     if not captures:
         raise UsageError("no capture is given", field="CAPTURES")
     salt = salt or secrets.token_hex(SALT_BYTES)
-    pairs: list[tuple[Capture, Split]] = []
-    for path in captures:
-        capture = open_capture(path)
-        if any(capture.info.id == other.info.id for other, _ in pairs):
-            raise BadCapture(
-                f"another capture has the id {capture.info.id!r} too", where=path, field="id"
-            )
-        pairs.append((capture, split_for(capture.info.id, len(capture), splits)))
-    contents = [target_content(capture, split) for capture, split in pairs]
-    commitments = [commitment(content, salt) for content in contents]
+    pairs = open_captures(captures, splits)
+    commitments = [commitment(target_content(*pair), salt) for pair in pairs]
     with atomic_folder(out) as root:
         for capture, split in pairs:
             name = capture.info.id
@@ -151,6 +142,24 @@ def publish(
     return Publication(
         folder / PUBLIC, folder / SEALED, joint, tuple(capture.info.id for capture, _ in pairs)
     )
+
+
+def open_captures(
+    paths: Sequence[str | os.PathLike[str]], splits: Mapping[str, Split] | None = None
+) -> list[tuple[Capture, Split]]:
+    """Open captures, each with its split; no two have one id."""
+    opened: list[tuple[Capture, Split]] = []
+    for path in paths:
+        capture = open_capture(path)
+        if any(other.info.id == capture.info.id for other, _ in opened):
+            raise BadCapture(
+                f"another capture has the id {capture.info.id!r} too",
+                where=path,
+                field="id",
+                remedy="Take them one by one, each into its own folder.",
+            )
+        opened.append((capture, split_for(capture.info.id, len(capture), splits)))
+    return opened
 
 
 def _without_place(capture: Capture) -> Capture:
@@ -181,58 +190,45 @@ class SealedPart:
 
     #: Capture folders, in the manifest's order.
     captures: tuple[Path, ...]
-    #: Splits by capture id.
+    #: By capture id.
     splits: Mapping[str, Split]
     #: Digest of all commitments (hex); equal to the public manifest's.
     commitment: str
 
 
-def open_sealed(
-    path: str | os.PathLike[str], manifest: str | os.PathLike[str] | None = None
-) -> SealedPart:
+def open_sealed(path: str | os.PathLike[str]) -> SealedPart:
     """Open a sealed part; every test frame and mask is read and compared."""
     root = Path(path)
     root = root / "sealed" if (root / "sealed" / KEY).is_file() else root
     key = root / KEY
     record = _read(key, SEALED_SCHEMA, _SealedKey)
-    captures, splits, commitments = [], {}, []
+    splits = {}
     for entry in record.captures:
         name, split = entry.id, Split.from_json(entry.split, where=os.fspath(key))
         check_id(name, os.fspath(key))
         capture = open_capture(root / name)
         if capture.info.id != name or split.capture != name or len(capture) != split.frame_count:
             raise BadInput("split and capture do not belong together", where=key, field=name)
-        committed = commitment(target_content(capture, split), record.salt)
-        if committed != entry.commitment:
+        if commitment(target_content(capture, split), record.salt) != entry.commitment:
             raise BadInput(
                 "is not what was committed to: its test frames, masks, split or salt were changed",
                 where=key,
                 field=name,
                 remedy="Get the sealed part again from its keeper.",
             )
-        captures.append(root / name)
         splits[name] = split
-        commitments.append(committed)
-    joint = joint_commitment(commitments)
+    joint = joint_commitment([entry.commitment for entry in record.captures])
     if record.commitment != joint:
         raise BadInput("does not match the captures", where=key, field="commitment")
-    _compare_public(root, manifest, joint)
-    return SealedPart(tuple(captures), splits, joint)
-
-
-def _compare_public(root: Path, manifest: str | os.PathLike[str] | None, joint: str) -> None:
-    default = root.parent / "public" / MANIFEST
-    if manifest is None and not default.is_file():
-        return
-    path = default if manifest is None else Path(manifest)
-    path = path / MANIFEST if path.is_dir() else path
-    if _read(path, PUBLIC_SCHEMA, PublicManifest).commitment != joint:
+    public = root.parent / "public" / MANIFEST
+    if public.is_file() and _read(public, PUBLIC_SCHEMA, PublicManifest).commitment != joint:
         raise BadInput(
             "publishes a commitment that is not this sealed part's",
-            where=path,
+            where=public,
             field="commitment",
             remedy="The two parts belong to different publications, or one of them was changed.",
         )
+    return SealedPart(tuple(root / name for name in splits), splits, joint)
 
 
 def read_manifest(public: str | os.PathLike[str]) -> PublicManifest:
@@ -248,7 +244,6 @@ def read_manifest(public: str | os.PathLike[str]) -> PublicManifest:
 class CommittedCapture:
     """One capture in a manifest or a sealed part's key file."""
 
-    #: Its id.
     id: Line
     #: `Split.from_json` checks it.
     split: Any
@@ -262,7 +257,6 @@ class PublicManifest:
 
     #: Digest of all commitments.
     commitment: Line
-    #: The captures.
     captures: Annotated[list[CommittedCapture], Meta(min_length=1)]
 
 

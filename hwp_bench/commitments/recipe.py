@@ -9,10 +9,8 @@ from __future__ import annotations
 import hashlib
 import hmac
 import os
-import secrets
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
-from pathlib import Path
 from typing import Annotated, Any
 
 from msgspec import Meta
@@ -40,20 +38,13 @@ class _File:
     secret: Digest
 
 
-def draw_secret() -> str:
-    """Return a new secret (hex) from the system's random numbers."""
-    return secrets.token_hex(SECRET_BYTES)
-
-
 def write_secret(path: str | os.PathLike[str], secret: str) -> None:
     """Write a secret to a file that only its owner may read."""
-    place = Path(path)
     previous = os.umask(0o077)
     try:
-        write_json(place, {"schema": SECRET_SCHEMA, "secret": secret})
+        write_json(path, {"schema": SECRET_SCHEMA, "secret": secret}).chmod(0o600)
     finally:
         os.umask(previous)
-    place.chmod(0o600)
 
 
 def read_secret(path: str | os.PathLike[str]) -> str:
@@ -116,9 +107,7 @@ class Recipe:
 
     #: Its scenes, each once.
     scenes: Annotated[tuple[RecipeScene, ...], Meta(min_length=1, max_length=MAX_CAPTURES)]
-    #: Edge of the images, px.
     size: Annotated[int, Meta(ge=16, le=4096)]
-    #: Version of the renderer.
     renderer: Annotated[int, Meta(ge=1, le=10**6)] = RENDERER
 
     def __post_init__(self) -> None:
@@ -156,9 +145,8 @@ def recipe_of(names: Sequence[str], frames: int, size: int) -> Recipe:
     if not 1 <= len(names) <= MAX_CAPTURES:
         raise UsageError(f"{len(names)} scenes are not from 1 to {MAX_CAPTURES}", field="SCENE")
     known = set(known_scenes())
-    digests = [load_scene(name).digest if name in known else "" for name in names]
-    rows = zip(names, digests, strict=True)
-    return Recipe(tuple(RecipeScene(name, digest, frames) for name, digest in rows), size)
+    digests = {name: load_scene(name).digest if name in known else "" for name in names}
+    return Recipe(tuple(RecipeScene(name, digests[name], frames) for name in names), size)
 
 
 def suite_recipe(name: str) -> Recipe:
@@ -170,11 +158,10 @@ def suite_recipe(name: str) -> Recipe:
 
 def sealed_items(recipe: Recipe, secret: str) -> tuple[SuiteItem, ...]:
     """Return the captures of a recipe under a secret, in the recipe's order."""
-    found = []
-    for row in recipe.scenes:
-        scene = sealed_scene(load_scene(row.name), secret)
-        found.append(SuiteItem(scene, row.frames, recipe.size))
-    return tuple(found)
+    return tuple(
+        SuiteItem(sealed_scene(load_scene(row.name), secret), row.frames, recipe.size)
+        for row in recipe.scenes
+    )
 
 
 def sealed_scene(scene: Scene, secret: str) -> Scene:

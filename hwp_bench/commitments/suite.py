@@ -7,6 +7,7 @@ submissions are scored, and then checked by anybody who renders the captures aga
 from __future__ import annotations
 
 import os
+import secrets
 from collections.abc import Collection
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -30,9 +31,9 @@ from hwp_bench.commitments.publication import (
     target_content,
 )
 from hwp_bench.commitments.recipe import (
+    SECRET_BYTES,
     Recipe,
     derived,
-    draw_secret,
     read_secret,
     read_strictly,
     sealed_items,
@@ -58,7 +59,6 @@ SUITE = "suite.json"
 class SuitePage:
     """The page that is published before anybody submits: the recipe, and two commitments."""
 
-    #: Everything but the secret.
     recipe: Recipe
     #: Binds the secret and the recipe (`secret.secret_commitment`).
     secret_commitment: Digest
@@ -89,7 +89,6 @@ def read_suite_page(public: str | os.PathLike[str]) -> SuitePage:
 class SealedSuite:
     """A sealed suite that was made."""
 
-    #: Part for authors.
     public: Path
     #: Part that scores submissions; stays with the organiser.
     sealed: Path
@@ -116,13 +115,8 @@ def make_suite(
         keeper.mkdir(exist_ok=True)
         keeper.chmod(0o700)
         hidden = _secret_of(keeper / SECRET, secret)
-        captures = ensure_suite(
-            sealed_items(recipe, hidden),
-            keeper / CAPTURES,
-            workers,
-            engine=engine,
-            needs=needs,
-        )
+        items = sealed_items(recipe, hidden)
+        captures = ensure_suite(items, keeper / CAPTURES, workers, engine=engine, needs=needs)
 
         def describe(public: Path, joint: str) -> None:
             write_suite_page(public, _page(recipe, hidden, joint))
@@ -154,7 +148,7 @@ def _secret_of(path: Path, given: str | None) -> str:
                 remedy="Give the same secret again, or another folder with -o.",
             )
         return kept
-    chosen = given or draw_secret()
+    chosen = given or secrets.token_hex(SECRET_BYTES)
     write_secret(path, chosen)
     return chosen
 
@@ -200,7 +194,6 @@ def read_revealed(path: str | os.PathLike[str]) -> Revealed:
 class CheckedCapture:
     """One capture that was made again."""
 
-    #: Its id.
     id: str
     #: Whether test frames, masks and split are those that the manifest is committed to.
     hidden: bool
@@ -219,7 +212,6 @@ class CheckedCapture:
 class Checked:
     """Captures that were made again and compared; the secret itself fits its commitment."""
 
-    #: The page of the suite.
     page: SuitePage
     #: Captures that were made again, in the recipe's order.
     captures: tuple[CheckedCapture, ...]
@@ -263,15 +255,12 @@ def check_revealed(
     chosen = [item for item in items if only is None or item.scene.id in only]
     if chosen:
         page.recipe.refuse_other_toolkit()
-    made = ensure_suite(chosen, work, workers)
     committed = {entry.id: entry.commitment for entry in manifest.captures}
-    captures = [open_capture(folder) for folder in made]
+    salt = suite_salt(found.secret)
+    captures = [open_capture(folder) for folder in ensure_suite(chosen, work, workers)]
     return Checked(
         page,
-        tuple(
-            _compare(Path(public), capture, committed[capture.info.id], suite_salt(found.secret))
-            for capture in captures
-        ),
+        tuple(_compare(Path(public), one, committed[one.info.id], salt) for one in captures),
     )
 
 

@@ -23,7 +23,7 @@ from hwp_bench.evaluation.scoring import (
     read_targets,
 )
 from hwp_bench.report.sources import ResultsSource
-from hwp_bench.results import CaptureResult, FrameResult
+from hwp_bench.results import FrameResult
 from hwp_bench.run.sandbox.supervise import MAX_LOG_BYTES
 from hwp_bench.run.worker import DIAGNOSTICS, LOG
 
@@ -60,10 +60,7 @@ def keep_artifacts(
 
 
 def keep_log(source: Path, target: Path) -> None:
-    """Copy a log, at most as much of it as the toolkit itself keeps of a method's output.
-
-    A method may have put another file in its place.
-    """
+    """Copy a log, or as much of what a method put in its place as the toolkit itself would keep."""
     with open(source, "rb") as stream:
         # What is kept of both ends, and the line between them.
         atomic_write(target, stream.read(MAX_LOG_BYTES + 1024))
@@ -134,14 +131,10 @@ def _prediction(scored: ScoredFrames, place: int) -> tuple[np.ndarray, str]:
     return pixels, f"PSNR {scored.scores[place].scores['psnr']:.2f} dB"
 
 
-def find_extreme_frames(frames: Sequence[FrameResult], metric: str = "psnr") -> dict[str, int]:
-    """Return the positions of the worst, median and best frame in a list of results."""
-    order = np.argsort([frame.scores[metric] for frame in frames], kind="stable")
-    return {
-        "worst": int(order[0]),
-        "median": int(order[len(order) // 2]),
-        "best": int(order[-1]),
-    }
+def find_extreme_frames(frames: Sequence[FrameResult]) -> dict[str, int]:
+    """Return the positions of the frames of worst, median and best PSNR in a list of results."""
+    order = np.argsort([frame.scores["psnr"] for frame in frames], kind="stable").tolist()
+    return {"worst": order[0], "median": order[len(order) // 2], "best": order[-1]}
 
 
 def free_view_picture(scored: ScoredFrames) -> np.ndarray:
@@ -170,7 +163,9 @@ def write_side_by_side(
     for capture in captures:
         name = capture.info.id
         found = [next(one for one in s.results.captures if one.id == name) for s in sources]
-        frame = _typical_frame(found)
+        scores = np.mean([[row.scores["psnr"] for row in one.frames] for one in found], axis=0)
+        order = np.argsort(scores, kind="stable")
+        frame = found[0].frames[int(order[len(order) // 2])].frame
         [target] = read_targets(capture, [frame])
         images: list[tuple[np.ndarray | None, str]] = [
             (target.pixels, f"truth: {name}, frame {frame}")
@@ -183,13 +178,6 @@ def write_side_by_side(
         box = square_around(target.region)
         tiles += [labelled(fitted(target.masked(image)[box], EDGE), text) for image, text in images]
     return write_image(path, sheet(tiles, columns=1 + len(sources)))
-
-
-def _typical_frame(found: Sequence[CaptureResult]) -> int:
-    """The frame of the median score, in the mean over the methods."""
-    scores = np.mean([[frame.scores["psnr"] for frame in one.frames] for one in found], axis=0)
-    order = np.argsort(scores, kind="stable")
-    return found[0].frames[int(order[len(order) // 2])].frame
 
 
 def square_around(region: np.ndarray) -> tuple[slice, slice]:

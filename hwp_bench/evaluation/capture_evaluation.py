@@ -46,17 +46,19 @@ from hwp_bench.run.worker import LOG, RunFacts, checkpoint_folder
 RECIPE = 1
 #: The result of one capture, inside its folder.
 RESULT = "result.json"
+# What a result repeats of a run's facts.
+_FACTS = (
+    *("fit_seconds", "render_seconds", "curve_seconds", "cpu_seconds"),
+    *("steps", "peak_memory"),
+)
 
 
 @dataclass(frozen=True)
 class CaptureEvaluation:
     """One method on one capture."""
 
-    #: The method.
     manifest: MethodManifest
-    #: The capture.
     capture: Capture
-    #: Its split.
     split: Split
     #: Settings, seed, budget and training frames.
     run: RunSettings
@@ -80,11 +82,11 @@ class CaptureEvaluation:
         """Digest (hex) of everything that decides the scores."""
         planned, clip = self.method_files, self.capture.free_view
         method = self.manifest.digest if planned is None else digest_of(planned)
-        return EvaluationKey(
+        return _key(
             method=(self.manifest.name, method),
             capture=self.capture.digest,
             split=self.split.digest,
-            settings=self.run.settings,
+            settings=dict(self.run.settings),
             seed=self.run.seed,
             budget=asdict(self.run.budget),
             frames=self.run.frames,
@@ -92,7 +94,7 @@ class CaptureEvaluation:
             networks=sorted(self.networks),
             exposed=self.exposed,
             free_view=None if clip is None else clip.digest,
-        ).digest
+        )
 
     def hiding(self, folder: Path) -> CaptureEvaluation:
         """Return the same where the method does not see a results folder, with its test frames."""
@@ -146,9 +148,9 @@ def _evaluate(
     output = folder / "run"
     record, failure = _run(evaluation, output, on_progress)
     _refuse_edited(evaluation)
-    started = time.perf_counter()
     # A run that failed left nothing that would be scored.
     record = record or RunRecord(output / "none", RunFacts(), 0.0, free_view=output / "none")
+    started = time.perf_counter()
     scored = score_frames_of(targets, record.predictions, capture.size, evaluation.networks)
     score_seconds = time.perf_counter() - started
     free = None
@@ -167,16 +169,11 @@ def _evaluate(
         frames=scored.scores,
         failure=None if failure is None else shown(failure)[:MAX_TEXT],
         predictions_digest=scored.digest,
-        fit_seconds=facts.fit_seconds,
-        render_seconds=facts.render_seconds,
         score_seconds=score_seconds,
         wall_seconds=record.wall_seconds,
-        steps=facts.steps,
-        peak_memory=facts.peak_memory,
         device=one_line(facts.device, 100) if facts.device else None,
         curve=_curve(evaluation, output, facts),
-        curve_seconds=facts.curve_seconds,
-        cpu_seconds=facts.cpu_seconds,
+        **{name: getattr(facts, name) for name in _FACTS},
         isolation=one_line(record.isolation) if record.isolation else None,
         free_view=FreeViewResult(clip.digest, free.scores, free.digest) if clip and free else None,
         made_by=capture.info.made_by,
@@ -249,14 +246,12 @@ def _curve(evaluation: CaptureEvaluation, output: Path, facts: RunFacts) -> list
 
 def _lacks_images(evaluation: CaptureEvaluation, record: RunRecord, output: Path) -> bool:
     """Whether an image that a run should have left is missing or damaged."""
-    capture, facts = evaluation.capture, record.facts
-    wanted = [(record.predictions, evaluation.split.test.tolist(), capture.size)]
-    clip = capture.free_view
+    capture, clip = evaluation.capture, evaluation.capture.free_view
+    folders = [checkpoint_folder(output, index) for index in range(len(record.facts.checkpoints))]
+    wanted = [(folder, record.facts.checkpoint_frames, capture.size) for folder in folders]
+    wanted.append((record.predictions, evaluation.split.test.tolist(), capture.size))
     if clip is not None and record.free_view is not None:
         wanted.append((record.free_view, list(range(len(clip))), clip.size))
-    for index in range(len(facts.checkpoints)):
-        folder = checkpoint_folder(output, index)
-        wanted.append((folder, facts.checkpoint_frames, capture.size))
     return any(
         read_prediction(folder, frame, size).failure is not None
         for folder, frames, size in wanted
@@ -336,47 +331,17 @@ def read_result(folder: Path) -> CaptureResult:
 # --- the key
 
 
-@dataclass(frozen=True)
-class EvaluationKey:
-    """Everything that decides the scores of a capture.
+def _key(*, exposed: str | None, free_view: str | None, **content: Any) -> str:
+    """Return the SHA-256 (hex) of everything that decides the scores of a capture.
 
     A stored result of the same key is taken as it is. The key also binds a result: whoever changes
     the name, settings, seed or budget of a result by hand leaves a key that is not of its content.
+    `exposed` is the digest of further files that the method is shown.
     """
-
-    #: Name and digest of the method.
-    method: tuple[str, str]
-    #: Digest of the capture, and of its split.
-    capture: str
-    split: str
-    #: The preset with its overrides.
-    settings: Mapping[str, Any]
-    #: Seed of everything random.
-    seed: int
-    #: `seconds` and `steps`, either may be None.
-    budget: Mapping[str, float | None]
-    #: The training frames that the method is given.
-    frames: str
-    #: Settings of the protocols that are scored.
-    protocols: Sequence[Mapping[str, Any]]
-    #: Backbones of LPIPS that are scored, sorted.
-    networks: Sequence[str]
-    #: Digest of further files that the method is shown; None where there are none.
-    exposed: str | None
-    #: Digest of the free-view clip; None where there is none.
-    free_view: str | None
-    #: Version of the evaluation.
-    recipe: int = RECIPE
-
-    @property
-    def digest(self) -> str:
-        """SHA-256 (hex) of all of it."""
-        content = {**vars(self), "settings": dict(self.settings), "budget": dict(self.budget)}
-        # What was added later does not change the keys of captures that have none of it.
-        for name in ("exposed", "free_view"):
-            if content[name] is None:
-                del content[name]
-        return sha256_json(content)
+    # What was added later does not change the keys of captures that have none of it.
+    later = {"exposed": exposed, "free_view": free_view}
+    content |= {name: digest for name, digest in later.items() if digest is not None}
+    return sha256_json({**content, "recipe": RECIPE})
 
 
 def key_of(results: Results, capture: CaptureResult, clip: str | None) -> str:
@@ -385,19 +350,19 @@ def key_of(results: Results, capture: CaptureResult, clip: str | None) -> str:
     `clip` is the digest of the capture's free-view clip; None where it has none.
     """
     scored = {name for frame in capture.frames for name in frame.scores}
-    return EvaluationKey(
+    return _key(
         method=(results.method.name, results.method.digest),
         capture=capture.digest,
         split=capture.split_digest,
-        settings=results.method.settings,
+        settings=dict(results.method.settings),
         seed=results.seed,
-        budget=results.budget,
+        budget=dict(results.budget),
         frames=results.frames,
         protocols=list(results.protocols.values()),
         networks=sorted({one.weights for one in METRICS if one.weights and one.name in scored}),
         exposed=capture.exposed,
         free_view=clip,
-    ).digest
+    )
 
 
 # --- in another process or on another machine

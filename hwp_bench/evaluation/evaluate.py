@@ -10,15 +10,17 @@ import datetime
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import TypedDict, Unpack
 
 from hwp_bench.base.console import notice
-from hwp_bench.base.errors import BadCapture, BadMethod, HwpError, UsageError, one_line
+from hwp_bench.base.errors import BadMethod, HwpError, UsageError, one_line
 from hwp_bench.base.files import Places, canonical_json, check_places, inside
 from hwp_bench.base.folders import exclusive
 from hwp_bench.base.packages import __version__
 from hwp_bench.base.records import check_json_values, merged, parse_record
-from hwp_bench.capture import Capture, open_capture
+from hwp_bench.capture import Capture
 from hwp_bench.capture.splits import Split, split_for
+from hwp_bench.commitments.publication import open_captures
 from hwp_bench.evaluation.capture_evaluation import CaptureEvaluation
 from hwp_bench.evaluation.results_folder import (
     RESULTS,
@@ -70,6 +72,19 @@ class EvaluationSettings:
     confinement: Confinement = field(default_factory=Confinement)
 
 
+class How(TypedDict, total=False):
+    """How the captures of a command are worked on; nothing of it decides a score."""
+
+    #: Where jobs run; without it in this process.
+    engine: Engine | None
+    #: The share of a machine that each job takes.
+    needs: Needs | None
+    #: Whether results of another evaluation are replaced, once all new ones are whole.
+    overwrite: bool
+    #: Whether the method is made once before the first capture.
+    rehearse: bool
+
+
 def default_folder(method: str, settings: EvaluationSettings) -> Path:
     """Return the results folder of an evaluation that names none.
 
@@ -92,10 +107,7 @@ def evaluate(
     *,
     splits: Mapping[str, Split] | None = None,
     on_capture: OnCapture | None = None,
-    engine: Engine | None = None,
-    needs: Needs | None = None,
-    overwrite: bool = False,
-    rehearse: bool = False,
+    **how: Unpack[How],
 ) -> Results:
     """Evaluate a method; `run_plans` says what becomes of results that are there.
 
@@ -106,17 +118,7 @@ def evaluate(
     settings = with_setting_files(manifest, settings)
     plan = make_plan(manifest, open_captures(captures, splits), settings)
     order = [("", place) for place in range(len(plan.evaluations))]
-    results = run_plans(
-        out,
-        {"": plan},
-        order,
-        on_start=on_capture,
-        engine=engine,
-        needs=needs,
-        overwrite=overwrite,
-        rehearse=rehearse,
-    )
-    return results[""]
+    return run_plans(out, {"": plan}, order, on_start=on_capture, **how)[""]
 
 
 def run_plans(
@@ -125,11 +127,8 @@ def run_plans(
     order: Sequence[tuple[str, int]],
     *,
     on_start: OnCapture | None,
-    engine: Engine | None,
-    needs: Needs | None,
-    overwrite: bool,
-    rehearse: bool,
     tables: bool = True,
+    **how: Unpack[How],
 ) -> dict[str, Results]:
     """Run what is missing of some plans, each in a folder below `out`, with the lock of `out`.
 
@@ -144,14 +143,17 @@ def run_plans(
                 notice(f"{name}: its true masks are not there: scored on its estimated masks")
         folders = {
             name: open_results_folder(
-                out / name, plan.results([]), plan.evaluations, overwrite=overwrite
+                out / name,
+                plan.results([]),
+                plan.evaluations,
+                overwrite=how.get("overwrite", False),
             )
             for name, plan in plans.items()
         }
         announce_kept(list(folders.values()))
         found = {name: dict(folder.kept) for name, folder in folders.items()}
         missing = [(name, place) for name, place in order if place not in found[name]]
-        if rehearse:
+        if how.get("rehearse"):
             # Plans that differ in their seeds alone are made once.
             first = {
                 canonical_json(plans[name].settings.run.settings): plans[name]
@@ -159,11 +161,11 @@ def run_plans(
             }
             for plan in first.values():
                 plan.rehearse()
-        jobs = []
+        jobs, needs = [], how.get("needs") or Needs()
         for name, place in missing:
             evaluation = plans[name].evaluations[place].hiding(out)
             text = ", ".join(filter(None, (evaluation.capture.info.id, plans[name].title)))
-            jobs.append(evaluation.job(folders[name].unfinished(place), text, needs or Needs()))
+            jobs.append(evaluation.job(folders[name].unfinished(place), text, needs))
 
         def record(name: str) -> Results:
             # By place, so that a record lists captures in one order whichever ended first.
@@ -175,7 +177,7 @@ def run_plans(
             if not tables and not folders[name].replaces:
                 write_results(folders[name].root / RESULTS, record(name))
 
-        (engine or LocalEngine()).run(jobs, on_done, on_start)
+        (how.get("engine") or LocalEngine()).run(jobs, on_done, on_start)
         results = {name: record(name) for name in plans}
         finish_together([(folders[name], results[name]) for name in plans], tables=tables)
         return results
@@ -198,7 +200,6 @@ def with_setting_files(
 class Plan:
     """A method with its settings on every capture; `evaluate_capture` runs one of them."""
 
-    #: The method.
     manifest: MethodManifest
     #: How it is evaluated: the preset that is taken, and all settings of the method.
     settings: EvaluationSettings
@@ -257,7 +258,7 @@ def make_plan(
     settings = replace(settings, preset=preset, run=replace(settings.run, settings=chosen))
     refuse_links_out(manifest.root, settings.confinement.exposed)
     files = method_files(manifest.root)
-    known = load_available() if networks is None else networks
+    networks = load_available() if networks is None else networks
     evaluations = tuple(
         CaptureEvaluation(
             manifest,
@@ -266,7 +267,7 @@ def make_plan(
             settings.run,
             settings.time_limit,
             settings.confinement,
-            known,
+            networks,
             files,
         )
         for capture, split in captures
@@ -277,24 +278,6 @@ def make_plan(
     head = asdict(plan.results([]))
     parse_record(Results, head, where=manifest.name, error=BadMethod)
     return plan
-
-
-def open_captures(
-    paths: Sequence[Path], splits: Mapping[str, Split] | None = None
-) -> list[tuple[Capture, Split]]:
-    """Open captures, each with its split."""
-    opened: list[tuple[Capture, Split]] = []
-    for path in paths:
-        capture = open_capture(path)
-        if any(other.info.id == capture.info.id for other, _ in opened):
-            raise BadCapture(
-                f"another capture has the id {capture.info.id!r} too",
-                where=path,
-                field="id",
-                remedy="Evaluate them one by one, each into its own folder.",
-            )
-        opened.append((capture, split_for(capture.info.id, len(capture), splits)))
-    return opened
 
 
 def check_results_place(

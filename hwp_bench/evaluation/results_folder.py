@@ -54,7 +54,6 @@ _SHOWN = 40
 class ResultsFolder:
     """The folder of one evaluation, and what is in it already."""
 
-    #: The folder.
     root: Path
     #: The evaluations, one a capture.
     evaluations: tuple[CaptureEvaluation, ...]
@@ -64,21 +63,17 @@ class ResultsFolder:
     replaces: bool
 
     @property
-    def missing(self) -> list[int]:
-        """Places of the evaluations that are to be run."""
-        return [place for place in range(len(self.evaluations)) if place not in self.kept]
-
     def captures(self) -> Path:
-        """Return the folder of the captures' folders."""
+        """The folder of the captures' folders."""
         return self.root / "captures"
 
     def final(self, place: int) -> Path:
         """Return the folder of a capture's result."""
-        return self.captures() / self.evaluations[place].capture.info.id
+        return self.captures / self.evaluations[place].capture.info.id
 
     def unfinished(self, place: int) -> Path:
         """Return the folder in which the result is made."""
-        return self.captures() / UNFINISHED / self.evaluations[place].capture.info.id
+        return self.captures / UNFINISHED / self.evaluations[place].capture.info.id
 
     def finish(self, place: int) -> CaptureResult:
         """Read a result that is whole, and give it its place unless others stand there."""
@@ -95,14 +90,14 @@ def finish_together(finished: Sequence[tuple[ResultsFolder, Results]], *, tables
         for folder, results in finished:
             if folder.replaces:
                 with disc_errors(folder.root):
-                    write_results(folder.captures() / UNFINISHED / RESULTS, results)
+                    write_results(folder.captures / UNFINISHED / RESULTS, results)
         for folder, results in finished:
             with disc_errors(folder.root):
                 if folder.replaces:
                     _replace(folder.root, tables=tables)
                 else:
                     _write(folder.root, results, tables=tables)
-                remove_tree(folder.captures() / UNFINISHED)
+                remove_tree(folder.captures / UNFINISHED)
 
 
 def open_results_folder(
@@ -111,18 +106,16 @@ def open_results_folder(
     """Look at what a folder holds, and say what of it is kept; to be called under its lock."""
     with disc_errors(root):
         _clean(root)
-    problems = differences(root, head, evaluations)
-    if problems and not overwrite:
-        raise _other(root, problems)
+    problems = refuse_other(root, head, evaluations, overwrite=overwrite)
     folder = ResultsFolder(root, tuple(evaluations), {}, bool(problems))
     if problems:
         notice(f"replaces, once all is done: {root} ({'; '.join(problems)})")
     else:
-        found = {
-            place: stored_result(evaluation, folder.final(place))
+        found = [
+            (place, stored_result(evaluation, folder.final(place)))
             for place, evaluation in enumerate(evaluations)
-        }
-        kept = {place: result for place, result in found.items() if result is not None}
+        ]
+        kept = {place: result for place, result in found if result is not None}
         folder = replace(folder, kept=kept)
     for place in range(len(evaluations)):
         # Of another key, or of a process that was killed; one of this key is taken as it is.
@@ -143,19 +136,22 @@ def announce_kept(folders: Sequence[ResultsFolder]) -> None:
         notice(f"kept, because nothing that decides a score differs: {named} ({whole})")
 
 
-def refuse_other(root: Path, head: Results) -> None:
-    """Refuse a folder with results of another evaluation, before captures are made for it."""
-    problems = differences(root, head, ())
-    if problems:
-        raise _other(root, problems)
-
-
-def _other(root: Path, problems: Sequence[str]) -> UsageError:
-    return UsageError(
-        f"holds results of another evaluation: {'; '.join(problems)}",
-        where=root,
-        remedy="Choose another folder with -o, or replace them with --overwrite.",
-    )
+def refuse_other(
+    root: Path,
+    head: Results,
+    evaluations: Sequence[CaptureEvaluation] = (),
+    *,
+    overwrite: bool = False,
+) -> list[str]:
+    """Refuse a folder with results of another evaluation, or say what these differ in."""
+    problems = differences(root, head, evaluations)
+    if problems and not overwrite:
+        raise UsageError(
+            f"holds results of another evaluation: {'; '.join(problems)}",
+            where=root,
+            remedy="Choose another folder with -o, or replace them with --overwrite.",
+        )
+    return problems
 
 
 def differences(root: Path, head: Results, evaluations: Sequence[CaptureEvaluation]) -> list[str]:
@@ -197,11 +193,8 @@ def _head_differences(stored: Results, head: Results) -> list[str]:
         problems.append(f"the method's files have changed (digest {digests})")
     pairs: dict[str, tuple[Any, Any]] = {
         "preset": (stored.method.preset, head.method.preset),
-        "seed": (stored.seed, head.seed),
-        "seconds": (stored.budget.get("seconds"), head.budget.get("seconds")),
-        "steps": (stored.budget.get("steps"), head.budget.get("steps")),
-        "frames": (stored.frames, head.frames),
-        "suite": (stored.suite, head.suite),
+        **{name: (stored.budget.get(name), head.budget.get(name)) for name in ("seconds", "steps")},
+        **{n: (getattr(stored, n), getattr(head, n)) for n in ("seed", "frames", "suite")},
     }
     old, new = (dict(flattened(one.method.settings)) for one in (stored, head))
     for name in sorted({*old, *new}):

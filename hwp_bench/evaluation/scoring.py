@@ -41,7 +41,6 @@ EXCHANGE_FRAMES = 0.75
 class Target:
     """The truth of one frame."""
 
-    #: Index in the capture.
     frame: int
     #: (H, W, 3) uint8 sRGB.
     pixels: np.ndarray
@@ -65,7 +64,6 @@ class Target:
 class Prediction:
     """One predicted frame, or the reason why it cannot be scored."""
 
-    #: Frame index in the capture.
     frame: int
     #: (H, W, 3) uint8 sRGB, or None.
     pixels: np.ndarray | None
@@ -77,7 +75,6 @@ class Prediction:
 class ScoredFrames:
     """Predictions of some frames of a capture, or of its free-view clip, with their scores."""
 
-    #: The truth.
     targets: Sequence[Target]
     #: One for each target, in the same order, as the scores.
     predictions: Sequence[Prediction]
@@ -110,10 +107,10 @@ def read_targets(capture: Capture, frames: Sequence[int]) -> list[Target]:
     ]
     empty = [target.frame for target in targets if not target.region.any()]
     if empty:
-        several = len(empty) > 1
+        one = len(empty) == 1
+        words = ("mask of test frame", "leaves") if one else ("masks of test frames", "leave")
         raise BadCapture(
-            f"the mask{'s' if several else ''} of test frame{'s' if several else ''} "
-            f"{bounded(empty)} leave{'' if several else 's'} no pixel to score",
+            f"the {words[0]} {bounded(empty)} {words[1]} no pixel to score",
             where=capture.root,
             field="masks",
             remedy="The test clip must show the hand in every frame.",
@@ -153,14 +150,12 @@ def score_predictions(
     """Score predictions in every protocol."""
     frames = [
         Frame(
-            BadPrediction(prediction.failure or "")
-            if prediction.pixels is None
-            else prediction.pixels,
+            BadPrediction(one.failure or "") if one.pixels is None else one.pixels,
             target.pixels,
             target.mask,
             coverage=target.exact,
         )
-        for target, prediction in zip(targets, predictions, strict=True)
+        for target, one in zip(targets, predictions, strict=True)
     ]
     return [
         FrameResult(target.frame, dict(score.values), score.failure)
@@ -180,15 +175,11 @@ def predictions_digest(predictions: Sequence[Prediction]) -> str:
 
     A failed frame enters with its name, so that a later repair changes the digest.
     """
-    total = hashlib.sha256()
-    for prediction in predictions:
-        content = (
-            f"failed {prediction.frame}"
-            if prediction.pixels is None
-            else pixel_digest(prediction.pixels)
-        )
-        total.update(content.encode())
-    return total.hexdigest()
+    parts = [
+        f"failed {one.frame}" if one.pixels is None else pixel_digest(one.pixels)
+        for one in predictions
+    ]
+    return hashlib.sha256("".join(parts).encode()).hexdigest()
 
 
 # --- colours that cannot be meant: the scores are what they are, and these sentences tell an

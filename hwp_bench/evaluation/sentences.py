@@ -25,13 +25,17 @@ def outcome_lines(out: Path, results: Results, head: str = "") -> list[str]:
     lines = []
     for capture in results.captures:
         folder = out / "captures" / capture.id
-        texts = [text for text in (failure_text(capture), free_view_text(capture)) if text]
-        lines += [f"failed: {head}{text}" for text in texts]
+        lines += [
+            f"failed: {head}{text}"
+            for text in (failure_text(capture), free_view_text(capture))
+            if text
+        ]
         if capture.failure and (folder / LOG).is_file():
             lines.append(f"log: {folder / LOG}")
         lines += [f"warning: {head}{capture.id}: {text}" for text in read_warnings(folder)]
-    facts = times_text(results, head), isolation_text(results, head)
-    return lines + [text for text in facts if text]
+    return lines + [
+        text for text in (times_text(results, head), isolation_text(results, head)) if text
+    ]
 
 
 def failure_text(capture: CaptureResult) -> str:
@@ -126,20 +130,20 @@ def find_wrong_labels(results: Results) -> list[str]:
     items = {item.scene.id: item for item in suite(results.suite)}
     problems = []
     for capture in results.captures:
-        if capture.id not in items:
-            continue
-        for name, found, wanted in _labels(capture, items[capture.id]):
+        item = items.get(capture.id)
+        labels: list[tuple[str, object, object]] = (
+            []
+            if item is None
+            else [
+                ("hands", capture.hands, item.scene.hands),
+                ("perturbations", sorted(capture.perturbations), declared_perturbations(item)),
+                ("exact_masks", capture.exact_masks, True),
+            ]
+        )
+        for name, found, wanted in labels:
             if found != wanted:
                 problems.append(f"{capture.id}: {name} {found!r} where the suite has {wanted!r}")
     return problems
-
-
-def _labels(capture: CaptureResult, item: SuiteItem) -> list[tuple[str, object, object]]:
-    return [
-        ("hands", capture.hands, item.scene.hands),
-        ("perturbations", sorted(capture.perturbations), declared_perturbations(item)),
-        ("exact_masks", capture.exact_masks, True),
-    ]
 
 
 def declared_perturbations(item: SuiteItem) -> list[str]:

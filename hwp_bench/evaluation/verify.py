@@ -6,11 +6,12 @@ PSNR and SSIM of some frames are computed a second time, by scikit-image. What n
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import zip_longest
+from itertools import product, zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ from hwp_bench.evaluation.scoring import ScoredFrames, Target, read_targets, sco
 from hwp_bench.evaluation.sentences import find_missing, find_other_captures, is_of_suite
 from hwp_bench.metrics import METRICS, PROTOCOLS, metric_names
 from hwp_bench.metrics.lpips import load_available
-from hwp_bench.metrics.protocol import HWP_V1, Protocol
+from hwp_bench.metrics.protocol import HWP_V1
 from hwp_bench.metrics.score import Network
 from hwp_bench.report.tables import all_tables, free_view_tables
 from hwp_bench.results import (
@@ -76,11 +77,9 @@ class Discrepancy:
 class Verification:
     """The outcome of the verification of one result."""
 
-    #: The result file.
     file: str
-    #: Captures whose scores were recomputed.
+    #: Captures and frames whose scores were recomputed.
     captures: int
-    #: Frames whose scores were recomputed.
     frames: int
     #: The differences; empty where the result holds.
     discrepancies: tuple[Discrepancy, ...]
@@ -119,11 +118,11 @@ def verify_results(
     scorer = _Scorer(load_available())
     scored, fitting = 0, []
     for record in results.captures:
-        capture = next((c for c in known.get(record.id, []) if c.digest == record.digest), None)
+        of_id = known.get(record.id, [])
+        capture = next((one for one in of_id if one.digest == record.digest), None)
         before = scorer.frames
         if capture is None:
-            seen = ", ".join(one.digest for one in known.get(record.id, []))
-            seen = seen or "no capture of this id"
+            seen = ", ".join(one.digest for one in of_id) or "no capture of this id"
             found.append(Discrepancy(record.id, "capture", record.digest, seen))
         else:
             fitting.append(capture)
@@ -136,27 +135,29 @@ def verify_results(
         found += _key_differences(results, record, capture)
     found += _suite_differences(results, fitting, own_splits=splits is not None)
     found += copy_differences(file.parent, stored, RESULT)
+    notes = _notes(results, scorer.networks)
     own = results.environment.get("code") == code_digest()
+    found += digest_differences(stored, expected=own)
     if own:
         found += _table_differences(file.parent, results)
-    found += digest_differences(stored, expected=own)
-    notes = _notes(results, scorer.networks)
-    if not own and (file.parent / "tables").is_dir():
-        notes.append("The tables next to it were not compared: other code made them.")
-    if stored.get("digest") is None and not own:
-        notes.append("It states no digest of its content: times and curves are as the file says.")
-    counts = scored, scorer.frames
-    return Verification(str(file), *counts, tuple(found), tuple(notes), scorer.cross_checked)
+    else:
+        if (file.parent / "tables").is_dir():
+            notes.append("The tables next to it were not compared: other code made them.")
+        if stored.get("digest") is None:
+            notes.append(
+                "It states no digest of its content: times and curves are as the file says."
+            )
+    return Verification(
+        str(file), scored, scorer.frames, tuple(found), tuple(notes), scorer.cross_checked
+    )
 
 
 def _by_id(folders: Sequence[Path]) -> dict[str, list[Capture]]:
     known: dict[str, list[Capture]] = {}
     for folder in folders:
-        try:
+        with contextlib.suppress(HwpError):
             capture = open_capture(folder)
-        except HwpError:
-            continue
-        known.setdefault(capture.info.id, []).append(capture)
+            known.setdefault(capture.info.id, []).append(capture)
     return known
 
 
@@ -190,9 +191,8 @@ def _capture_differences(
         return found
     targets = read_targets(capture, numbers)
     found += _label_differences(record, capture, all(target.exact for target in targets))
-    found += scorer.compare(
-        name, record, targets, inside(root, f"captures/{name}/predictions"), capture.size
-    )
+    folder = inside(root, f"captures/{name}/predictions")
+    found += scorer.compare(name, record, targets, folder, capture.size)
     return found + _free_view_differences(root, record, capture, scorer)
 
 
@@ -240,18 +240,14 @@ class _Scorer:
         return found + self._cross_check(name, record.frames, scored)
 
     def _cross_check(
-        self,
-        name: str,
-        frames: Sequence[FrameResult],
-        scored: ScoredFrames,
+        self, name: str, frames: Sequence[FrameResult], scored: ScoredFrames
     ) -> list[Discrepancy]:
         """Compare some recorded scores with scikit-image's."""
         found = []
-        valid = [place for place, one in enumerate(scored.predictions) if one.pixels is not None]
-        for place in [valid[sample] for sample in sample_frames(len(valid))] if valid else []:
-            target, pixels = scored.targets[place], scored.predictions[place].pixels
-            old = frames[place]
-            assert pixels is not None
+        rows = zip(scored.targets, scored.predictions, frames, strict=True)
+        valid = [(target, one.pixels, old) for target, one, old in rows if one.pixels is not None]
+        for place in sample_frames(len(valid)) if valid else []:
+            target, pixels, old = valid[place]
             scores = reference_scores(pixels, target.pixels, target.mask, coverage=target.exact)
             for metric, value in scores.items():
                 recorded = old.scores.get(metric)
@@ -269,14 +265,16 @@ def _frame_differences(name: str, old: FrameResult, new: FrameResult) -> list[Di
         found.append(Discrepancy(name, f"{place}, failure", *texts))
     for metric in [*(name for name in new.scores if name not in old.scores), *old.scores]:
         before, again = old.scores.get(metric), new.scores.get(metric)
-        if before is not None and again is not None:
-            if abs(again - before) > TOLERANCE:
-                what = f"{place}, {metric}"
-                found.append(Discrepancy(name, what, repr(before), repr(again)))
-        elif metric not in _with_weights():
-            recorded = "not there" if before is None else repr(before)
-            now = "no such metric" if again is None else repr(again)
-            found.append(Discrepancy(name, f"{place}, {metric}", recorded, now))
+        if before is None or again is None:
+            differs = metric not in _with_weights()
+        else:
+            differs = abs(again - before) > TOLERANCE
+        if differs:
+            texts = (
+                "not there" if before is None else repr(before),
+                "no such metric" if again is None else repr(again),
+            )
+            found.append(Discrepancy(name, f"{place}, {metric}", *texts))
     return found
 
 
@@ -300,9 +298,8 @@ def reference_scores(
     mask: np.ndarray,
     *,
     coverage: bool,
-    protocol: Protocol = HWP_V1,
 ) -> dict[str, float]:
-    """Compute PSNR (dB, at most `protocol.psnr_cap`) and SSIM of the scored pixels by scikit-image.
+    """Compute PSNR (dB, at most the cap) and SSIM of the scored pixels by scikit-image.
 
     Everything off them is black in both images, (H, W, 3) uint8 sRGB; `mask` is (H, W) uint8, the
     data set's own visible-hand mask, which may be exact coverage. The settings are those of Wang
@@ -310,21 +307,19 @@ def reference_scores(
     """
     from skimage.metrics import structural_similarity
 
-    region = _scored_region(mask, protocol.mask_erosion, coverage)
+    region = _scored_region(mask, HWP_V1.mask_erosion, coverage)
     # Black beyond the frame, where scikit-image would mirror the image; only the part of the frame
     # that the windows of scored pixels reach.
-    settings = protocol.ssim
+    settings = HWP_V1.ssim
     border = 2 * settings.radius
-    rows, columns = (np.flatnonzero(region.any(axis=axis)) for axis in (1, 0))
-    part = (
-        slice(int(rows[0]), int(rows[-1]) + 2 * border + 1),
-        slice(int(columns[0]), int(columns[-1]) + 2 * border + 1),
+    part = tuple(
+        slice(int(places[0]), int(places[-1]) + 2 * border + 1)
+        for places in (np.flatnonzero(region.any(axis=axis)) for axis in (1, 0))
     )
     inside = np.pad(region, border)[part]
+    around = ((border, border), (border, border), (0, 0))
     x, y = (
-        np.pad(np.where(region[..., None], as_float(image), 0.0), ((border,) * 2,) * 2 + ((0, 0),))[
-            part
-        ]
+        np.pad(np.where(region[..., None], as_float(image), 0.0), around)[part]
         for image in (prediction, target)
     )
     _, similarity = structural_similarity(
@@ -340,7 +335,7 @@ def reference_scores(
         K2=settings.k2,
     )
     return {
-        "psnr": _psnr(x[inside], y[inside], protocol.psnr_cap),
+        "psnr": _psnr(x[inside], y[inside], HWP_V1.psnr_cap),
         "ssim": float(similarity.mean(axis=2)[inside].mean()),
     }
 
@@ -372,12 +367,11 @@ def _psnr(x: np.ndarray, y: np.ndarray, cap: float) -> float:
 
 def _label_differences(record: CaptureResult, capture: Capture, exact: bool) -> list[Discrepancy]:
     """Compare what a result says of a capture with what the capture says of itself."""
-    info = capture.info
     wanted = {
-        "hands": info.hands,
-        "perturbations": list(info.perturbations),
+        "hands": capture.info.hands,
+        "perturbations": list(capture.info.perturbations),
         "exact_masks": exact,
-        "made_by": info.made_by,
+        "made_by": capture.info.made_by,
     }
     return [
         Discrepancy(record.id, name, _brief(getattr(record, name)), _brief(value))
@@ -434,13 +428,11 @@ def copy_differences(root: Path, value: Mapping[str, Any], name: str) -> list[Di
             found.append(Discrepancy(record["id"], name, "a copy of this capture", error.problem))
             continue
         copy = copy if isinstance(copy, dict) else {}
-        odd = [key for key in {*record, *copy} if record.get(key) != copy.get(key)]
-        found += [
-            Discrepancy(
-                record["id"], f"{name}, {key}", _brief(record.get(key)), _brief(copy.get(key))
-            )
-            for key in sorted(odd)
-        ]
+        for key in sorted({*record, *copy}):
+            ours, theirs = record.get(key), copy.get(key)
+            if ours != theirs:
+                what = f"{name}, {key}"
+                found.append(Discrepancy(record["id"], what, _brief(ours), _brief(theirs)))
     return found
 
 
@@ -451,12 +443,8 @@ def _table_differences(root: Path, results: Results) -> list[Discrepancy]:
     except HwpError as error:
         return [Discrepancy("", "tables", "tables of the result", error.problem)]
     found = []
-    for what, table, ending in [
-        (f"tables/{name}.{ending}", table, ending)
-        for name, table in tables.items()
-        for ending in FORMATS
-    ]:
-        made = format_table(table, ending)
+    for (name, table), ending in product(tables.items(), FORMATS):
+        what, made = f"tables/{name}.{ending}", format_table(table, ending)
         try:
             path = inside(root, what)
             text = path.read_text("utf-8") if path.is_file() else made
@@ -491,9 +479,8 @@ def _notes(results: Results, networks: Mapping[str, Network]) -> list[str]:
             "It does not say that each run began with new caches: code that another method left "
             "may have run in it. Only a new run can tell."
         )
-    recorded = results.environment.get("packages")
+    recorded, ours = results.environment.get("packages"), mine["packages"]
     theirs = recorded if isinstance(recorded, dict) else {}
-    ours = mine["packages"]
     other = [
         f"{package} {theirs.get(package, 'absent')} (here {ours.get(package, 'absent')})"
         for package in sorted(theirs.keys() | ours.keys())

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -42,18 +42,6 @@ PLACE = "leaderboard/entries"
 TEXT = "PULL_REQUEST.md"
 
 
-@dataclass(frozen=True)
-class Submitted:
-    """A submission that was written."""
-
-    #: Its folder.
-    folder: Path
-    #: Its entries.
-    entries: tuple[Entry, ...]
-    #: Captures whose predictions lay next to the results, of how many, by entry.
-    predictions: Mapping[str, tuple[int, int]]
-
-
 def add_entry(folder: Path, results: Results) -> Path:
     """Write an entry of results without a submission; returns its file.
 
@@ -74,36 +62,36 @@ def submit(
     existing: Sequence[Entry],
     submission: Submission,
     avatars: Path | None = None,
-) -> Submitted:
-    """Write a folder with everything that a pull request needs."""
+) -> list[tuple[Entry, int]]:
+    """Write a folder with everything that a pull request needs.
+
+    Returns:
+        Its entries, each with the number of captures whose predictions lie next to the results.
+    """
     refuse_installed(folder)
     if submission.revises is not None and len(sources) != 1:
         raise UsageError("a revision is of one result", field="--revises")
-    made: list[Entry] = []
-    checked = {}
+    made: list[tuple[Entry, int]] = []
     for source in sources:
         added = submission
         if avatars is not None:
-            digests = avatar_digests(avatars, [c.id for c in source.results.captures])
-            added = Submission(
-                submission.by, submission.revises, submission.reason, submission.links, digests
-            )
+            captures = [capture.id for capture in source.results.captures]
+            added = replace(submission, avatars=avatar_digests(avatars, captures))
         entry = make_entry(source.results, added)
         check_current(entry)
+        others = [*existing, *(one for one, _ in made)]
         # The rules of single entries come first: only a known suite can be complete.
-        check_entries([*existing, *made, entry])
+        check_entries([*others, entry])
         check_complete(entry)
         check_bound(entry)
-        if entry.name in {other.name for other in [*existing, *made]}:
+        if entry.name in {other.name for other in others}:
             raise UsageError("is on the leaderboard already", where=entry.name)
-        checked[entry.name] = (_check_predictions(source), len(source.results.captures))
-        made.append(entry)
+        made.append((entry, _check_predictions(source)))
     with atomic_folder(folder) as temporary:
-        for entry in made:
+        for entry, _ in made:
             write_entry(temporary / PLACE, entry)
-        done = Submitted(folder, tuple(made), checked)
-        (temporary / TEXT).write_text(pull_request_text(done), encoding="utf-8")
-    return done
+        (temporary / TEXT).write_text(pull_request_text(made), encoding="utf-8")
+    return made
 
 
 def _check_predictions(source: ResultsSource) -> int:
@@ -151,13 +139,12 @@ def _is_avatar_of(place: Path, name: str) -> bool:
     return not place.is_symlink() and (place.name == name or place.stem == name)
 
 
-def pull_request_text(done: Submitted) -> str:
+def pull_request_text(made: Iterable[tuple[Entry, int]]) -> str:
     """Return the text of the pull request, Markdown: the rows, their digests, how to check."""
     lines = ["# New leaderboard rows", ""]
-    for entry in done.entries:
+    for entry, there in made:
         results, added = entry.results, entry.submission
-        scores = results.scores
-        there, count = done.predictions[entry.name]
+        scores, count = results.scores, len(results.captures)
         lines += [
             f"## {_plain(results.method.title)} on {results.suite}",
             "",
@@ -174,8 +161,9 @@ def pull_request_text(done: Submitted) -> str:
         lines += [f"- {name}: <{address}>" for name, address in sorted(added.links.items())]
         lines += ["", "| capture | predictions | avatar |", "| --- | --- | --- |"]
         lines += [
-            f"| {_plain(c.id)} | `{c.predictions_digest}` | {_digest_cell(added, c.id)} |"
+            f"| {_plain(c.id)} | `{c.predictions_digest}` | {avatar} |"
             for c in results.captures
+            for avatar in [f"`{added.avatars[c.id]}`" if added.avatars.get(c.id) else "–"]
         ]
         lines.append("")
     lines += [
@@ -189,11 +177,6 @@ def pull_request_text(done: Submitted) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _digest_cell(submission: Submission, capture: str) -> str:
-    digest = submission.avatars.get(capture)
-    return f"`{digest}`" if digest else "–"
-
-
 def _plain(text: str) -> str:
     """Return a text without the characters that mean something in Markdown or HTML."""
     return "".join(char for char in text if char not in "`|<>[]*_\\") or "–"
@@ -204,26 +187,22 @@ TOLERANCE = 0.1
 
 
 def confirm(
-    entries: Sequence[Entry],
+    entry: Entry,
     file: Path,
     captures: Sequence[Path],
     *,
     by: str,
-    name: str | None = None,
     tolerance: float = TOLERANCE,
     overrules: Sequence[str] = (),
     reason: str = "",
 ) -> Check:
-    """Check the entry that a result is of, or is a second run of.
+    """Check the entry that a result is of, or is a second run of (`entry_of`).
 
     The result is verified first (`hwp-bench verify`). Where it is the entry's own, the check is
     of the kind `rescored`, and reproduces where nothing differs. Where it is another run of the
     same method, settings, seed, budget and data, the kind is `re-run`.
     """
-    if not 0 <= tolerance <= 100:
-        raise UsageError(f"{tolerance} is not between 0 and 100 dB", field="--tolerance")
     results = read_results(file)
-    entry = entry_of(entries, results, name)
     overruled = _overruled(entry, overrules)
     own = entry.results == results
     found = verify_results(file, captures)

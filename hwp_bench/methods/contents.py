@@ -26,23 +26,19 @@ _MARKED_FILES = ("capture.json", "results.json")
 _MARK, _HEAD_BYTES = b'"hwp-', 256
 #: How `base.files.temporary_name` calls what a killed run leaves half written.
 _TEMPORARY = re.compile(r"\..+\.[0-9a-f]{12}(\.old)?")
+_INTERPRETER = re.compile(r"/bin/python[^/]*$")
 #: The file that makes a folder an environment of Python.
 _ENVIRONMENT = "pyvenv.cfg"
 
 
-def method_digest(root: Path) -> str:
-    """SHA-256 (hex) of every file of a method: code, settings, weights and anything else.
-
-    Names and contents count, at any depth and whatever they end with. Left out are folders in
-    `LEFT_OUT`, and captures and outputs of runs (`is_foreign`). A link counts by its name and the
-    place that it leads to: a file inside the folder counts itself, and what lies outside of it is
-    refused by `refuse_links_out`.
-    """
-    return digest_of(method_files(root))
-
-
 def method_files(root: Path) -> dict[str, str]:
-    """Return the SHA-256 (hex) of each file and link of a method by its name below the folder."""
+    """Return the SHA-256 (hex) of each file and link of a method by its name below the folder.
+
+    Code, settings, weights and anything else count, at any depth and whatever they end with. Left
+    out are folders in `LEFT_OUT`, and captures and outputs of runs (`is_foreign`). A link counts by
+    its name and the place that it leads to: a file inside the folder counts itself, and what lies
+    outside of it is refused by `refuse_links_out`.
+    """
     return _digests(root, own=True)
 
 
@@ -73,18 +69,14 @@ def left_out_folders(root: Path) -> list[Path]:
     Those in an environment of Python are not listed: what is compiled there belongs to packages,
     of which there are thousands.
     """
-    found = []
-    waiting = [root]
+    found, waiting = [], [root]
     while waiting:
         folder = waiting.pop()
         entries = _scan(folder)
         if folder != root and is_foreign(folder, [entry.name for entry in entries]):
             continue
-        for entry in entries:
-            if not entry.is_dir(follow_symlinks=False):
-                continue
-            path = Path(entry.path)
-            if entry.name in LEFT_OUT:
+        for path in (Path(e.path) for e in entries if e.is_dir(follow_symlinks=False)):
+            if path.name in LEFT_OUT:
                 found.append(path)
             elif not (path / _ENVIRONMENT).is_file():
                 waiting.append(path)
@@ -124,7 +116,10 @@ def refuse_links_out(root: Path, exposed: Iterable[Path]) -> None:
         if target.is_relative_to(top):
             if LEFT_OUT.isdisjoint(target.relative_to(top).parts):
                 continue
-        elif _is_interpreter(Path(entry.path)):
+        # The Python of an environment always leads out of it.
+        elif (Path(entry.path).parent.parent / _ENVIRONMENT).is_file() and _INTERPRETER.search(
+            entry.path
+        ):
             continue
         raise BadMethod(
             f"is a link to {target}, which is not a part of the method's digest",
@@ -132,12 +127,6 @@ def refuse_links_out(root: Path, exposed: Iterable[Path]) -> None:
             remedy="Put a copy in its place, or show the method that place with --expose: a score "
             "stands under the digest of everything that decides it.",
         )
-
-
-def _is_interpreter(link: Path) -> bool:
-    """Whether a link is the Python of an environment, which always leads out of it."""
-    in_environment = (link.parent.parent / _ENVIRONMENT).is_file()
-    return in_environment and link.parent.name == "bin" and link.name.startswith("python")
 
 
 def _digests(root: Path, *, own: bool) -> dict[str, str]:

@@ -7,7 +7,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import numpy as np
 from msgspec import Meta
@@ -162,7 +162,6 @@ class FreeViews:
 
     #: Parameters of every frame, by side: true angles, with the betas of the capture.
     hands: Mapping[str, HandParameters]
-    #: The cameras of every frame.
     cameras: Cameras
 
     def __len__(self) -> int:
@@ -177,29 +176,20 @@ class FreeViews:
 class RequestRecord:
     """The fields of `request.json`, but for its schema."""
 
-    #: Id of the capture.
+    #: The capture's id, hands, frame size [px], frames per second and hand model.
     id: Line
-    #: The hands that it shows.
-    hands: Literal["right", "left", "both"]
-    #: Frame width, px.
+    hands: str = field(metadata={"choices": tuple(SIDES)})
     width: _Pixels
-    #: Frame height, px.
     height: _Pixels
-    #: Frames per second.
     fps: FrameRate
-    #: The hand model that the parameters belong to.
     hand_model: HandModelId
-    #: The split; `Split.from_json` checks it.
+    #: `Split.from_json` checks it.
     split: Any
-    #: Settings of the method.
+    #: As `RunSettings` has them.
     settings: dict[str, Any]
-    #: Seed of everything random.
     seed: Seed
-    #: When to stop fitting.
     budget: Budget
-    #: Which training frames are given.
     frames: Line
-    #: Indices of the training frames.
     train: list[Annotated[int, Meta(ge=0)]]
     #: Frames of the free-view clip; 0 where the capture has none.
     free_view: Annotated[int, Meta(ge=0, le=MAX_FRAMES)] = 0
@@ -208,36 +198,26 @@ class RequestRecord:
 
 
 class TrainingCapture:
-    """The part of a capture that a method sees.
-
-    Attributes:
-        root: the request folder.
-        id: the capture's id.
-        sides: the hands in it, `right`, `left` or both.
-        width: frame width, px.
-        height: frame height, px.
-        fps: frames per second.
-        hand_model: the hand model that the parameters belong to.
-        split: which frames train, validate, and are to be predicted.
-        hands: estimated parameters of every frame, by side.
-        cameras: the cameras of every frame.
-        run: settings, seed and budget.
-        free_views: what is rendered of the free-view clip, or None where there is none.
-    """
+    """The part of a capture that a method sees."""
 
     def __init__(self, root: Path, record: RequestRecord) -> None:
-        self.root = root
-        self.id = record.id
+        #: The request folder, and the capture's id.
+        self.root, self.id = root, record.id
+        #: The hands in it, `right`, `left` or both.
         self.sides: tuple[str, ...] = SIDES[record.hands]
-        self.width, self.height = record.width, record.height
-        self.fps = record.fps
+        #: Size of the frames, px, and frames per second.
+        self.width, self.height, self.fps = record.width, record.height, record.fps
+        #: The hand model that the parameters belong to.
         self.hand_model = record.hand_model
+        #: Which frames train, validate, and are to be predicted.
         self.split = Split.from_json(record.split, where=os.fspath(root / REQUEST))
-        self.hands: dict[str, HandParameters] = read_hands(
-            root / HANDS, self.sides, self.split.frame_count
-        )
-        self.cameras: Cameras = read_cameras(root / CAMERAS, self.split.frame_count)
+        count = self.split.frame_count
+        #: Estimated parameters of every frame, by side, and the cameras of every frame.
+        self.hands: dict[str, HandParameters] = read_hands(root / HANDS, self.sides, count)
+        self.cameras: Cameras = read_cameras(root / CAMERAS, count)
+        #: Settings, seed and budget.
         self.run = RunSettings(record.settings, record.seed, record.budget, record.frames)
+        #: What is rendered of the free-view clip, or None where there is none.
         self.free_views: FreeViews | None = None
         if record.free_view:
             self.free_views = FreeViews(
@@ -257,11 +237,7 @@ class TrainingCapture:
         return self._train
 
     def thinned(self, most: int) -> TrainingCapture:
-        """Return the same capture with fewer training frames, evenly spread over those there are.
-
-        Args:
-            most: training frames that are kept, at least 1.
-        """
+        """Return the same capture with at most `most` training frames, evenly spread."""
         if len(self._train) <= most:
             return self
         fewer = copy.copy(self)
@@ -269,11 +245,7 @@ class TrainingCapture:
         return fewer
 
     def with_hands(self, hands: Mapping[str, HandParameters]) -> TrainingCapture:
-        """Return the same capture with other hand parameters of every frame.
-
-        Args:
-            hands: by side.
-        """
+        """Return the same capture with other hand parameters of every frame, by side."""
         other = copy.copy(self)
         other.hands = dict(hands)
         return other
@@ -308,11 +280,7 @@ class TrainingCapture:
         """Load the hand template of one side.
 
         It is that of the hand model; in an error budget with the truth `mesh` it is the subject's
-        own, which no shape parameter changes.
-
-        Raises:
-            BadInput: the template that is installed here is not the capture's, or the subject's
-                own is damaged.
+        own, which no shape parameter changes. A template that is not the capture's is refused.
         """
         from hwp_bench.capture.reader import load_matching_template
         from hwp_bench.capture.schema import read_subject_mesh

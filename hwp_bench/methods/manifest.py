@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import itertools
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,7 +24,7 @@ from hwp_bench.base.records import (
     parse_toml,
     without_schema,
 )
-from hwp_bench.methods.contents import method_digest
+from hwp_bench.methods.contents import digest_of, method_files
 from hwp_bench.methods.settings import class_settings
 from hwp_bench.taxonomy import SIZED_LIKE
 
@@ -91,7 +91,6 @@ class Switch:
     name: str
     #: Name in tables; its short name where the file does not say.
     title: Line = ""
-    #: One sentence.
     description: Line = ""
     #: Settings that override the preset in its variant: those that take a component out, or those
     #: that put an alternative in the place of what the method does otherwise.
@@ -128,11 +127,9 @@ class ManifestFields:
 
     #: Short name: letters, digits, `.`, `_`, `-`.
     name: _MethodName
-    #: How it is entered.
     entry: Entry
     #: Name in tables; the short name where the file does not say.
     title: Line = ""
-    #: One sentence about the method.
     description: Line = ""
     #: Who made it, its terms of use, its page.
     authors: Line = ""
@@ -159,7 +156,6 @@ class ManifestFields:
 class MethodManifest(ManifestFields):
     """A checked `method.toml`; all its `settings` are names."""
 
-    #: The method directory.
     root: Path
 
     @property
@@ -171,25 +167,14 @@ class MethodManifest(ManifestFields):
         """Refuse a setting that the method does not have, before anything runs.
 
         Methods that do not list their settings take any; the values are the method's to check.
-
-        Args:
-            values: settings by name; `a.b` and tables within tables are the same.
-            field: where they come from, for the message.
-
-        Raises:
-            BadMethod: a name is not in `settings`; the message says which one is close.
+        `a.b` and tables within tables are the same. `field` says where the settings come from.
         """
         known, tables = set(self.settings), {name.rpartition(".")[0] for name in self.settings}
         for name, _ in flattened(values) if self.settings else ():
             above = itertools.accumulate(name.split("."), "{}.{}".format)
-            if name in tables or not known.isdisjoint(above):
-                continue
-            raise BadMethod(
-                f"{name[:100]!r} is not a setting of {self.name}",
-                where=self.root / MANIFEST,
-                field=field,
-                remedy=self._nearest_settings(name),
-            )
+            if name not in tables and known.isdisjoint(above):
+                problem = f"{name[:100]!r} is not a setting of {self.name}"
+                raise self._wrong(problem, field, self._nearest_settings(name))
 
     def doubt_setting_names(self, values: Mapping[str, Any], field: str = "settings") -> None:
         """Refuse a name that is nearly one of the presets', where the method lists no settings.
@@ -199,22 +184,17 @@ class MethodManifest(ManifestFields):
         """
         tables = [*self.presets.values(), *(switch.settings for switch in self.switches.values())]
         known = {name for table in tables for name, _ in flattened(table)}
-        if self.settings or not known:
-            return
-        for name, _ in flattened(values):
-            if name in known:
-                continue
+        unknown = [name for name, _ in flattened(values) if name not in known]
+        for name in unknown if known and not self.settings else ():
             close = nearest(name, sorted(known), most=3, cutoff=0.75)
-            if not close:
-                notice(f"{field}: {name}: {self.name} does not list its settings; not checked")
-                continue
-            raise BadMethod(
-                f"{name[:100]!r} is in no preset or switch of {self.name}",
-                where=self.root / MANIFEST,
-                field=field,
-                remedy=f"Did you mean {' or '.join(map(repr, close))}? If it is a setting, list "
-                "the names of all under `settings`.",
-            )
+            if close:
+                problem = f"{name[:100]!r} is in no preset or switch of {self.name}"
+                remedy = f"Did you mean {' or '.join(map(repr, close))}? If it is a setting, list "
+                raise self._wrong(problem, field, remedy + "the names of all under `settings`.")
+            notice(f"{field}: {name}: {self.name} does not list its settings; not checked")
+
+    def _wrong(self, problem: str, field: str, remedy: str) -> BadMethod:
+        return BadMethod(problem, where=self.root / MANIFEST, field=field, remedy=remedy)
 
     def _nearest_settings(self, wrong: str) -> str:
         """Say which setting was probably meant, or which there are in its place."""
@@ -232,30 +212,21 @@ class MethodManifest(ManifestFields):
     def preset(self, name: str | None, suite: str = "") -> str:
         """Return the name of the preset to use.
 
-        Args:
-            name: what was asked for; None takes the one named like the suite where the method
-                has it, else that of a suite of the same size, else `default`.
-            suite: name of the suite.
-
-        Raises:
-            BadMethod: there is no such preset.
+        None takes the one named like the suite where the method has it, else that of a suite of
+        the same size, else `default`.
         """
         if name is None:
             fitting = (suite, SIZED_LIKE.get(suite, ""))
             return next((name for name in fitting if name in self.presets), DEFAULT_PRESET)
         if name not in self.presets and name != DEFAULT_PRESET:
-            raise BadMethod(
-                f"has no preset {name!r}",
-                where=self.root / MANIFEST,
-                field="presets",
-                remedy=f"It has: {', '.join(self.presets) or DEFAULT_PRESET}.",
-            )
+            known = ", ".join(self.presets) or DEFAULT_PRESET
+            raise self._wrong(f"has no preset {name!r}", "presets", f"It has: {known}.")
         return name
 
     @property
     def digest(self) -> str:
         """SHA-256 (hex) of every file of the method: what was run."""
-        return method_digest(self.root)
+        return digest_of(method_files(self.root))
 
 
 def find_method(text: str) -> Path:
@@ -304,10 +275,10 @@ def read_manifest(path: str | os.PathLike[str]) -> MethodManifest:
         raise BadMethod(f"is larger than {MAX_BYTES} bytes", where=where)
     try:
         text = where.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise BadMethod(f"is not valid TOML ({error})", where=where) from error
-    except OSError as error:
-        raise BadMethod(f"cannot be read ({error.strerror})", where=where) from error
+    except (UnicodeDecodeError, OSError) as error:
+        broken = isinstance(error, UnicodeDecodeError)
+        problem = f"is not valid TOML ({error})" if broken else f"cannot be read ({error})"
+        raise BadMethod(problem, where=where) from error
     value = parse_toml(text, where=where, error=BadMethod)
     fields = without_schema(value, SCHEMA, where=where, error=BadMethod)
     authors = fields.get("authors")
@@ -319,11 +290,9 @@ def read_manifest(path: str | os.PathLike[str]) -> MethodManifest:
     if isinstance(switches, dict) and all(isinstance(item, dict) for item in switches.values()):
         fields["switches"] = {name: {**item, "name": name} for name, item in switches.items()}
     table = parse_record(ManifestFields, fields, where=where, error=BadMethod)
-    names = [
-        name
-        for item in table.settings
-        for name in (class_settings(root, item) if ":" in item else [item])
-    ]
+    names: list[str] = []
+    for item in table.settings:
+        names += class_settings(root, item) if ":" in item else [item]
     known = {**vars(table), "settings": names, "title": table.title or table.name}
     manifest = MethodManifest(**known, root=root)
     if table.entry.predictions is not None:
@@ -364,21 +333,29 @@ def find_setting_files(
     manifest: MethodManifest, values: Mapping[str, Any]
 ) -> tuple[dict[str, Any], tuple[Path, ...]]:
     """Make the paths in a person's settings absolute, since a method runs in another folder."""
-    found: list[Path] = []
+    found: dict[Path, None] = {}
 
-    def resolve(table: Mapping[str, Any], prefix: str) -> dict[str, Any]:
-        made: dict[str, Any] = {}
-        for name, value in table.items():
-            full = f"{prefix}{name}"
-            if isinstance(value, Mapping):
-                made[name] = resolve(value, f"{full}.")
-            elif isinstance(value, str):
-                made[name] = _absolute(manifest.files.get(full, []), full, value, found)
-            else:
-                made[name] = value
-        return made
+    def resolve(value: Any, name: str) -> Any:
+        if isinstance(value, Mapping):
+            return {
+                key: resolve(item, f"{name}.{key}" if name else key) for key, item in value.items()
+            }
+        kind, colon, place = value.partition(":") if isinstance(value, str) else ("", "", "")
+        if not colon or kind not in manifest.files.get(name, []):
+            return value
+        path = Path(os.path.abspath(Path(place).expanduser()))
+        if not place or not path.exists():
+            raise UsageError(
+                "does not exist" if place else "names no file",
+                where=path if place else None,
+                field=name,
+                remedy=f"Give {kind}:PATH with a file or folder of yours; nothing is downloaded.",
+            )
+        found[path] = None
+        return f"{kind}:{path}"
 
-    return resolve(values, ""), tuple(dict.fromkeys(found))
+    resolved: dict[str, Any] = resolve(values, "")
+    return resolved, tuple(found)
 
 
 def check_settings(
@@ -396,22 +373,6 @@ def check_settings(
     if files and manifest.check_files and ships(manifest.root):
         module, _, function = manifest.check_files.partition(":")
         getattr(importlib.import_module(module), function)(resolved)
-
-
-def _absolute(kinds: Sequence[str], name: str, value: str, found: list[Path]) -> str:
-    kind, colon, place = value.partition(":")
-    if not colon or kind not in kinds:
-        return value
-    path = Path(os.path.abspath(Path(place).expanduser()))
-    if not place or not path.exists():
-        raise UsageError(
-            "does not exist" if place else "names no file",
-            where=path if place else None,
-            field=name,
-            remedy=f"Give {kind}:PATH with a file or folder of yours; nothing is downloaded.",
-        )
-    found.append(path)
-    return f"{kind}:{path}"
 
 
 def ships(root: Path) -> bool:

@@ -15,7 +15,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
@@ -87,7 +87,7 @@ def write_request(path: Path, capture: Capture, split: Split, run: RunSettings) 
                 shutil.copyfile(source, target)
         write_hands(root / HANDS, material.hands)
         write_cameras(root / CAMERAS, capture.cameras)
-        mesh = replaces_mesh(run.frames)
+        mesh = "mesh" in _replaced_by(run.frames)
         if mesh:
             own = {side: capture.true_template(side) for side in info.sides}
             write_subject_mesh(root / TEMPLATE, own)
@@ -96,24 +96,28 @@ def write_request(path: Path, capture: Capture, split: Split, run: RunSettings) 
             (root / FREE_VIEW).mkdir()
             write_hands(root / FREE_VIEW / HANDS, choose_free_view_hands(clip, run.frames))
             write_cameras(root / FREE_VIEW / CAMERAS, clip.cameras)
-        description = {
-            "schema": SCHEMA,
-            "id": info.id,
-            "hands": info.hands,
-            "width": info.width,
-            "height": info.height,
-            "fps": info.fps,
-            "hand_model": info.to_json()["hand_model"],
-            "split": split.to_json(),
-            "settings": dict(run.settings),
-            "seed": run.seed,
-            "budget": {"seconds": run.budget.seconds, "steps": run.budget.steps},
-            "frames": run.frames,
-            "train": material.train.tolist(),
-            **({"free_view": len(clip)} if clip is not None else {}),
-            **({"own_template": True} if mesh else {}),
-        }
-        write_json(root / REQUEST, description)
+        record = RequestRecord(
+            id=info.id,
+            hands=info.hands,
+            width=info.width,
+            height=info.height,
+            fps=info.fps,
+            hand_model=info.hand_model,
+            split=split.to_json(),
+            settings=dict(run.settings),
+            seed=run.seed,
+            budget=run.budget,
+            frames=run.frames,
+            train=material.train.tolist(),
+            free_view=0 if clip is None else len(clip),
+            own_template=mesh,
+        )
+        content = {"schema": SCHEMA, **asdict(record)}
+        # What a capture does not have is not said.
+        for name in ("free_view", "own_template"):
+            if not content[name]:
+                del content[name]
+        write_json(root / REQUEST, content)
     return path
 
 
@@ -136,7 +140,6 @@ def open_request(path: str | os.PathLike[str]) -> TrainingCapture:
 class TrainingInputs:
     """Where the training part of a request comes from."""
 
-    #: Indices of the training frames.
     train: np.ndarray
     #: Kind of image that is given as frames, a key of `IMAGE_FOLDERS`.
     frames: str
@@ -149,11 +152,8 @@ class TrainingInputs:
 def frame_choice(truths: Iterable[str]) -> str:
     """The choice of frames in which the truth replaces some estimates."""
     asked = set(truths)
-    return (
-        _PREFIX + ",".join(name for name in ORACLE_INPUTS if name in asked)
-        if asked
-        else "perturbed"
-    )
+    names = ",".join(name for name in ORACLE_INPUTS if name in asked)
+    return _PREFIX + names if names else FRAME_CHOICES[0]
 
 
 def known_oracle_inputs(capture: Capture) -> tuple[str, ...]:
@@ -202,11 +202,6 @@ def choose_free_view_hands(clip: Capture, choice: str) -> dict[str, HandParamete
     # The subject's mesh has the true shape in it, and so belongs in the places of that shape.
     exact = bool({"betas", "mesh"} & set(_replaced_by(choice)))
     return dict(truth if exact and truth is not None else clip.hands)
-
-
-def replaces_mesh(choice: str) -> bool:
-    """Whether a choice of frames replaces the template by the subject's own mesh."""
-    return "mesh" in _replaced_by(choice)
 
 
 def _replaced_by(choice: str) -> list[str]:

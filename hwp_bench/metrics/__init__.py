@@ -1,7 +1,7 @@
 """Scoring: which pixels, which formula, which mean. The protocol is in `docs/protocol.md`.
 
 This package loads nothing heavy; import the arithmetic from the module that does it:
-`metrics.score` (one frame, many frames), `metrics.aggregate`, `metrics.lpips_weights`.
+`metrics.score` (one frame, many frames, their means), `metrics.lpips`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from hwp_bench.metrics.protocol import (
     metric,
     metric_names,
     penalty,
-    protocol,
 )
 
 __all__ = [
@@ -29,5 +28,4 @@ __all__ = [
     "metric",
     "metric_names",
     "penalty",
-    "protocol",
 ]

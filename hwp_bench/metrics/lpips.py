@@ -1,9 +1,8 @@
 """LPIPS in plain torch (Zhang et al., CVPR 2018, version 0.1), and where its weights lie.
 
-Nothing is downloaded. The backbone is the torchvision checkpoint in the torch hub cache or a
-file given by path; the linear layers come from the `lpips` package (or torchmetrics, which
-ships the same bytes) or a file given by path. A file that is not byte for byte the published
-one is refused: the number would not be LPIPS.
+Nothing is downloaded. The backbone is the torchvision checkpoint in the torch hub cache; the
+linear layers come from the `lpips` package, or torchmetrics, which ships the same bytes. A file
+that is not byte for byte the published one is refused: the number would not be LPIPS.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hwp_bench.base.errors import BadInput, MissingDependency, ShapeMismatch, UsageError
+from hwp_bench.base.errors import BadInput, MissingDependency, ShapeMismatch
 from hwp_bench.metrics.pixels import check_same_shape
 
 if TYPE_CHECKING:
@@ -39,9 +38,8 @@ class Convolution:
 
     #: Place in `features`: its weights are `features.{index}.weight` and `.bias`.
     index: int
-    #: Input and output channels.
+    #: Input and output channels, then side of the kernel, stride and padding, px.
     channels: tuple[int, int]
-    #: Side of the kernel, px.
     kernel: int
     stride: int
     padding: int
@@ -53,18 +51,11 @@ class Convolution:
 
 def _vgg_block(first: int, channels: tuple[int, int], count: int) -> tuple[Convolution, ...]:
     """`count` 3x3 convolutions; the first changes the channels, the last is compared."""
-    return tuple(
-        Convolution(
-            index=first + 2 * k,
-            channels=channels if k == 0 else (channels[1], channels[1]),
-            kernel=3,
-            stride=1,
-            padding=1,
-            pool=(2, 2) if k == 0 and first > 0 else None,
-            tap=k == count - 1,
-        )
-        for k in range(count)
-    )
+    pool = (2, 2) if first > 0 else None
+    head = Convolution(first, channels, 3, 1, 1, pool, tap=count == 1)
+    wide = (channels[1], channels[1])
+    rest = [Convolution(first + 2 * k, wide, 3, 1, 1, tap=k == count - 1) for k in range(1, count)]
+    return (head, *rest)
 
 
 #: The convolutional parts of AlexNet (one-column form) and VGG-16.
@@ -89,14 +80,8 @@ BACKBONES: Mapping[str, tuple[Convolution, ...]] = {
 class Lpips:
     """The distance with its weights.
 
-    Args:
-        net: "alex" or "vgg".
-        backbone: state of the torchvision classifier; only its `features.*` are used.
-        linear: state of the LPIPS linear layers, `lin{0..4}.model.1.weight` (1, C, 1, 1).
-        device: where it runs.
-
-    Raises:
-        BadInput: a weight is missing, of another shape, or not finite.
+    `backbone` is the state of the torchvision classifier, of which only `features.*` are used;
+    `linear` that of the linear layers, `lin{0..4}.model.1.weight` (1, C, 1, 1).
     """
 
     def __init__(
@@ -104,10 +89,7 @@ class Lpips:
         net: str,
         backbone: Mapping[str, torch.Tensor],
         linear: Mapping[str, torch.Tensor],
-        device: str = "cpu",
     ) -> None:
-        self.net = net
-        self.device = device
         self._layers = BACKBONES[net]
         self._weights: list[tuple[torch.Tensor, torch.Tensor]] = []
         for layer in self._layers:
@@ -116,10 +98,10 @@ class Lpips:
             shape = (fan_out, fan_in, layer.kernel, layer.kernel)
             weight = _checked(backbone, f"{name}.weight", shape)
             bias = _checked(backbone, f"{name}.bias", (fan_out,))
-            self._weights.append((weight.to(device), bias.to(device)))
+            self._weights.append((weight, bias))
         taps = [layer.channels[1] for layer in self._layers if layer.tap]
         self._linear = [
-            _checked(linear, f"lin{k}.model.1.weight", (1, channels, 1, 1)).to(device)
+            _checked(linear, f"lin{k}.model.1.weight", (1, channels, 1, 1))
             for k, channels in enumerate(taps)
         ]
 
@@ -128,7 +110,7 @@ class Lpips:
         import torch
 
         check_same_shape(prediction, target)
-        pair = torch.from_numpy(np.stack([prediction, target])).to(self.device, torch.float32)
+        pair = torch.from_numpy(np.stack([prediction, target])).to(torch.float32)
         pair = pair.permute(0, 3, 1, 2) * 2.0 - 1.0
         with torch.inference_mode():
             return float(self.distance(pair[:1], pair[1:])[0])
@@ -137,7 +119,7 @@ class Lpips:
         """LPIPS of image batches.
 
         Args:
-            x: (B, 3, H, W) float in [-1, 1], on the device of the weights.
+            x: (B, 3, H, W) float in [-1, 1].
 
         Returns:
             (B,): over the compared layers, the sum of the spatial means of the weighted squared
@@ -209,69 +191,39 @@ LINEAR_PACKAGES = (
 )
 
 
-@dataclass(frozen=True)
-class LpipsFiles:
-    """The two files that one network needs; None means "look in the usual place"."""
-
-    #: The torchvision checkpoint.
-    backbone: Path | None = None
-    #: The linear layers of LPIPS 0.1.
-    linear: Path | None = None
-
-
-def lpips_available(net: str, files: LpipsFiles | None = None) -> str | None:
+def lpips_available(net: str) -> str | None:
     """Why LPIPS with this backbone cannot be computed here; None if it can.
 
     Looks for the files only (no torch import, no reading): a damaged file shows in `load_lpips`.
     """
     try:
-        find_weights(net, files)
+        _find_backbone(net)
+        _find_linear(net)
     except MissingDependency as error:
         return str(error)
     return None
 
 
-def find_weights(net: str, files: LpipsFiles | None = None) -> tuple[Path, Path]:
-    """The backbone and the linear file of a network."""
-    if net not in BACKBONE_FILES:
-        raise UsageError(
-            f"LPIPS has no network {net!r}", field="net", remedy="There are alex and vgg."
-        )
-    files = files or LpipsFiles()
-    return _find_backbone(net, files.backbone), _find_linear(net, files.linear)
-
-
-def load_lpips(net: str, files: LpipsFiles | None = None, device: str = "cpu") -> Lpips:
+def load_lpips(net: str) -> Lpips:
     """LPIPS with the weights found on this machine."""
-    backbone, linear = find_weights(net, files)
+    backbone, linear = _find_backbone(net), _find_linear(net)
     prefixes = [Path(name).stem.rsplit("-", 1)[1] for name in BACKBONE_FILES[net]]
-    return Lpips(
-        net,
-        _read_state(backbone, prefixes),
-        _read_state(linear, [LINEAR_DIGESTS[net]]),
-        device,
-    )
+    return Lpips(net, _read_state(backbone, prefixes), _read_state(linear, [LINEAR_DIGESTS[net]]))
 
 
-def load_available(device: str = "cpu") -> dict[str, Lpips]:
-    """Every network whose weights lie in the usual places, by name; may be empty."""
-    return {
-        net: load_lpips(net, device=device)
-        for net in BACKBONE_FILES
-        if lpips_available(net) is None
-    }
+def load_available() -> dict[str, Lpips]:
+    """Every network whose weights are there, by name; may be empty."""
+    return {net: load_lpips(net) for net in BACKBONE_FILES if lpips_available(net) is None}
 
 
-def _hub_checkpoints() -> Path:
-    """The folder that torch.hub keeps checkpoints in, found without importing torch."""
+def torch_home() -> Path:
+    """The folder of torch's downloaded weights, found without importing torch."""
     cache = os.environ.get("XDG_CACHE_HOME", "~/.cache")
-    home = os.environ.get("TORCH_HOME", os.path.join(cache, "torch"))
-    return Path(home).expanduser() / "hub" / "checkpoints"
+    return Path(os.environ.get("TORCH_HOME") or f"{cache}/torch").expanduser()
 
 
-def _find_backbone(net: str, given: Path | None) -> Path:
-    folder = _hub_checkpoints()
-    candidates = [given] if given else [folder / name for name in BACKBONE_FILES[net]]
+def _find_backbone(net: str) -> Path:
+    candidates = [torch_home() / "hub" / "checkpoints" / name for name in BACKBONE_FILES[net]]
     for path in candidates:
         if path.is_file():
             return path
@@ -282,11 +234,7 @@ def _find_backbone(net: str, given: Path | None) -> Path:
     )
 
 
-def _find_linear(net: str, given: Path | None) -> Path:
-    if given is not None:
-        if given.is_file():
-            return given
-        raise MissingDependency("the linear layers of LPIPS are not there", where=given)
+def _find_linear(net: str) -> Path:
     for package, folder in LINEAR_PACKAGES:
         spec = importlib.util.find_spec(package)
         for root in (spec.submodule_search_locations or []) if spec else []:
@@ -295,7 +243,7 @@ def _find_linear(net: str, given: Path | None) -> Path:
                 return path
     raise MissingDependency(
         f"the linear layers of LPIPS ({net}) are not there",
-        remedy="Install the package lpips (without its dependencies is enough), or give a path.",
+        remedy="Install the package lpips (without its dependencies is enough).",
     )
 
 

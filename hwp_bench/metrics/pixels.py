@@ -34,12 +34,7 @@ MASK_THRESHOLD = 127
 
 
 def check_truth(target: np.ndarray, mask: np.ndarray) -> None:
-    """Refuse a target and mask that cannot be scored against.
-
-    Args:
-        target: (H, W, 3) uint8.
-        mask: (H, W) uint8 or bool.
-    """
+    """Refuse a target, (H, W, 3) uint8, and mask, (H, W), that cannot be scored against."""
     if target.dtype != np.uint8:
         raise BadImage(f"the target is {target.dtype}, not uint8", field="target")
     if target.ndim != 3 or target.shape[2] != 3 or target.size == 0:
@@ -71,13 +66,7 @@ def check_prediction(prediction: np.ndarray, target: np.ndarray) -> None:
 def check_same_shape(
     prediction: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None
 ) -> None:
-    """Refuse arrays that do not describe one image.
-
-    Args:
-        prediction: (H, W, 3).
-        target: (H, W, 3).
-        mask: (H, W), or None.
-    """
+    """Refuse arrays that do not describe one image: two (H, W, 3), and a mask (H, W) or None."""
     if prediction.shape != target.shape or target.ndim != 3:
         raise ShapeMismatch(
             f"prediction and target are {prediction.shape} and {target.shape}, not both (H, W, 3)"
@@ -126,32 +115,18 @@ class Box:
 
 
 def hand_pixels(mask: np.ndarray) -> np.ndarray:
-    """The pixels that show the hand, mixed border pixels included.
-
-    Args:
-        mask: (H, W) uint8 (above 127 is hand) or bool.
-
-    Returns:
-        (H, W) bool.
-    """
+    """The pixels that show the hand, mixed border pixels included: (H, W) bool."""
     return mask if mask.dtype == np.bool_ else mask > MASK_THRESHOLD
 
 
 def scored_pixels(mask: np.ndarray, *, erosion: int, coverage: bool = False) -> np.ndarray:
-    """The pixels that the hand covers fully.
+    """The pixels that the hand covers fully: (H, W) bool, may be empty.
 
     A quarter of the squared error otherwise sits in border pixels that mix hand and
-    background, and measures the background.
-
-    Args:
-        mask: (H, W) uint8 or bool, the data set's own visible-hand mask.
-        erosion: pixels that the mask loses at its border, to all eight neighbours; the frame's
-            border takes nothing away, because the hand goes on behind it.
-        coverage: True where `mask` says which share of a pixel the hand covers (255 = all):
-            then the pixels at 255 are taken as they are, without erosion.
-
-    Returns:
-        (H, W) bool; may be empty.
+    background, and measures the background. The mask loses `erosion` pixels at its border, to all
+    eight neighbours; the frame's border takes nothing away, because the hand goes on behind it.
+    With `coverage` the mask says which share of a pixel the hand covers (255 = all): then the
+    pixels at 255 are taken as they are, without erosion.
     """
     if coverage:
         return mask.copy() if mask.dtype == np.bool_ else mask == 255
@@ -177,11 +152,7 @@ def bounding_box(region: np.ndarray) -> Box:
 
 
 def crop(image: np.ndarray, box: Box) -> np.ndarray:
-    """The pixels of `box`, zero (black, or False) where it leaves the frame.
-
-    Args:
-        image: (H, W) or (H, W, C), any type.
-    """
+    """The pixels of `box`, zero (black, or False) where it leaves the frame."""
     height, width = image.shape[:2]
     out = np.zeros(box.shape + image.shape[2:], image.dtype)
     top, bottom = max(box.top, 0), min(box.bottom, height)
@@ -204,17 +175,11 @@ def similarity(
     product: np.ndarray,
     constants: tuple[float, float, float],
 ) -> None:
-    """SSIM of every window and channel, in place of `product`.
+    """SSIM of every window and channel, in place of `product`; all are (N,) float64.
 
-    Variances are clamped at 0 and the covariance to what they allow.
-
-    Args:
-        means: (N,) float64 window means of x and of y.
-        squares: (N,) float64 window means of x * x and of y * y.
-        product: (N,) float64 window means of x * y; is overwritten.
-        constants: C1, C2, and the factor on variances and covariance.
-
-    Source: Wang et al., 2004, equation 13.
+    They are window means of x and y, of their squares and of x * y; constants are C1, C2, and the
+    factor on variances and covariance. Variances are clamped at 0 and the covariance to what they
+    allow. Source: Wang et al., 2004, equation 13.
     """
     mean_x, mean_y = means
     square_x, square_y = squares
@@ -249,16 +214,11 @@ def ssim_map(x: np.ndarray, y: np.ndarray, settings: SsimSettings = HWP_V1.ssim)
     neither leave [-1, 1] nor make identical images differ from 1.
 
     Args:
-        x: (H, W, 3) float64.
-        y: (H, W, 3) float64.
-        settings: window, covariance and data range.
+        x: (H, W, 3) float64, like `y`.
 
     Returns:
         (H - 2r, W - 2r) float64 in [-1, 1], mean over channels, r = `settings.radius`; entry
         (0, 0) belongs to the window centred on pixel (r, r).
-
-    Raises:
-        ShapeMismatch: shapes differ, or the image is smaller than the window.
     """
     check_same_shape(x, y)
     if min(x.shape[:2]) < settings.size:
@@ -283,23 +243,9 @@ def ssim_box(
 ) -> float:
     """SSIM averaged over all windows inside the tight box of `mask`, black outside it.
 
-    The released evaluator's form. A box smaller than the window is grown to its size.
-
-    Args:
-        prediction: (H, W, 3) float in [0, 1], sRGB.
-        target: (H, W, 3) float in [0, 1], sRGB.
-        mask: (H, W) bool, the scored pixels.
-        settings: window, covariance and data range.
-
-    Returns:
-        the mean, in [-1, 1].
-
-    Raises:
-        ShapeMismatch: the three do not describe the same image.
-        EmptyMask: no pixel to score.
-
-    Source: protocol paper-wildghand; the oracle in the tests is scikit-image's
-    `structural_similarity` with its defaults and a data range of 2.
+    The released evaluator's form, of (H, W, 3) float in [0, 1], sRGB, and (H, W) bool. A box
+    smaller than the window is grown to its size. Source: protocol paper-wildghand; the oracle in
+    the tests is scikit-image's `structural_similarity` with its defaults and a data range of 2.
     """
     check_same_shape(prediction, target, mask)
     box = bounding_box(mask).at_least(settings.size)
@@ -343,18 +289,13 @@ def oriented_distance(
     (weighted by its share of the pixel at that scale), then over the scales.
 
     Args:
-        prediction: (H, W, 3) float in [0, 1], sRGB.
-        target: (H, W, 3) float in [0, 1], sRGB.
+        prediction: (H, W, 3) float in [0, 1], sRGB, like `target`.
         mask: (H, W) bool, the scored pixels.
         padding: pixels that the mask's box is grown by.
 
     Returns:
         0 for identical images, at most 1 (black against white); symmetric. Filters run in
         float32, means in float64.
-
-    Raises:
-        ShapeMismatch: the three do not describe the same image.
-        EmptyMask: no pixel to score.
 
     Source: `docs/protocol.md`; the form follows Zhang et al., CVPR 2018, equation 1.
     """
@@ -451,11 +392,7 @@ def filter_bank() -> FilterBank:
 def oriented_energies(plane: np.ndarray) -> np.ndarray:
     """Amplitude of the oriented structure around every pixel; black beyond the border.
 
-    Args:
-        plane: (H, W) float32.
-
-    Returns:
-        (H, W, ORIENTATIONS) float32, not negative.
+    (H, W) float32 gives (H, W, ORIENTATIONS) float32, not negative.
     """
     bank = filter_bank()
     even_basis = cv2.merge([_separable(plane, *kernels) for kernels in bank.even])

@@ -57,7 +57,6 @@ class Protocol:
     smallest_lpips_box: int
     #: Largest PSNR, dB: the score of identical images.
     psnr_cap: float
-    #: The structural similarity.
     ssim: SsimSettings
 
     def as_dict(self) -> dict[str, Any]:
@@ -93,27 +92,12 @@ PAPER_WILDGHAND = Protocol(
 PROTOCOLS = (HWP_V1, PAPER_WILDGHAND)
 
 
-def protocol(name: str) -> Protocol:
-    """The protocol of that name.
-
-    Raises:
-        UsageError: there is none; the message offers the nearest name.
-    """
-    for candidate in PROTOCOLS:
-        if candidate.name == name:
-            return candidate
-    names = [candidate.name for candidate in PROTOCOLS]
-    hint = did_you_mean(name, names) or f"There are: {', '.join(names)}."
-    raise UsageError(f"no protocol is called {name!r}", field="protocol", remedy=hint)
-
-
 @dataclass(frozen=True)
 class Metric:
     """The facts of a metric."""
 
     #: Key in results; unique over all protocols.
     name: str
-    #: Heading in tables.
     label: str
     #: Name of the protocol that defines it.
     protocol: str
@@ -127,9 +111,7 @@ class Metric:
     penalty: float
     #: Digits after the decimal point that tables print.
     digits: int
-    #: Where the formula comes from.
     reference: str
-    #: What it measures, in one line.
     description: str
     #: The LPIPS backbone whose weights the user must have; None for weight-free metrics.
     weights: str | None = None
@@ -204,22 +186,16 @@ def metric(name: str) -> Metric:
     raise UsageError(f"no metric is called {name!r}", field="metric", remedy=hint)
 
 
-def metric_names(
-    protocols: Iterable[Protocol] = PROTOCOLS, networks: Iterable[str] = ()
-) -> tuple[str, ...]:
-    """Names of the metrics that `protocols` give, in table order.
+def metric_names(networks: Iterable[str] = ()) -> tuple[str, ...]:
+    """Names of the metrics that are scored, in table order.
 
     Args:
-        protocols: the protocols to score in.
         networks: the LPIPS backbones at hand ("alex", "vgg"); without one its metric is absent.
     """
-    names = {chosen.name for chosen in protocols}
     available = {None, *networks}
-    return tuple(m.name for m in METRICS if m.protocol in names and m.weights in available)
+    return tuple(item.name for item in METRICS if item.weights in available)
 
 
-def penalty(
-    protocols: Iterable[Protocol] = PROTOCOLS, networks: Iterable[str] = ()
-) -> dict[str, float]:
+def penalty(networks: Iterable[str] = ()) -> dict[str, float]:
     """The declared scores of a frame that failed, for the metrics of `metric_names`."""
-    return {name: metric(name).penalty for name in metric_names(protocols, networks)}
+    return {name: metric(name).penalty for name in metric_names(networks)}

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import os
-from collections import deque
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -36,7 +36,7 @@ from hwp_bench.metrics.pixels import (
     ssim_box,
     ssim_map,
 )
-from hwp_bench.metrics.protocol import HWP_V1, PAPER_WILDGHAND, PROTOCOLS, Protocol, penalty
+from hwp_bench.metrics.protocol import HWP_V1, PAPER_WILDGHAND, Protocol, penalty
 
 #: A distance of two (H, W, 3) float images in [0, 1]; `hwp_bench.metrics.lpips.Lpips` is one.
 Network = Callable[[np.ndarray, np.ndarray], float]
@@ -50,7 +50,6 @@ class _Pair:
 
     #: (H, W, 3) uint8.
     prediction: np.ndarray
-    #: (H, W, 3) uint8.
     target: np.ndarray
     #: (H, W) bool, the hand with its mixed border pixels.
     hand: np.ndarray
@@ -58,13 +57,14 @@ class _Pair:
     covered: np.ndarray
     #: (H, W) float64, squared error in units of 1, mean over channels; 0 outside `hand`.
     error: np.ndarray
+    #: LPIPS by backbone.
+    networks: Mapping[str, Network]
 
 
 def score_frame(
     prediction: np.ndarray,
     target: np.ndarray,
     mask: np.ndarray,
-    protocols: Iterable[Protocol] = PROTOCOLS,
     *,
     coverage: bool = False,
     networks: Mapping[str, Network] | None = None,
@@ -78,23 +78,21 @@ def score_frame(
             that it has on disk: clipped, rounded half to even.
         target: (H, W, 3) like `prediction`.
         mask: (H, W) uint8 (above 127 is hand) or bool, the data set's own visible-hand mask.
+        coverage: whether the mask holds the hand's share of each pixel.
+        networks: LPIPS by backbone.
     """
     target = _eight_bits(target, "target", BadImage)
     check_truth(target, mask)
-    chosen = tuple(protocols)
     hand = hand_pixels(mask)
     covered = scored_pixels(mask, erosion=HWP_V1.mask_erosion, coverage=coverage)
-    bounding_box(covered if HWP_V1 in chosen else hand)
+    bounding_box(covered)
     prediction = _eight_bits(prediction, "prediction", BadPrediction)
     check_prediction(prediction, target)
 
     unit = 1.0 / 255.0**2
     error = squared_error(composite(prediction, hand), composite(target, hand)) * unit
-    pair = _Pair(prediction, target, hand, covered, error)
-    scores: dict[str, float] = {}
-    for protocol in chosen:
-        scores |= _SCORERS[protocol.name](pair, protocol, networks or {})
-    return scores
+    pair = _Pair(prediction, target, hand, covered, error, networks or {})
+    return {**_score_hwp_v1(pair), **_score_paper_wildghand(pair)}
 
 
 def _eight_bits(image: np.ndarray, field: str, error: type[BadInput]) -> np.ndarray:
@@ -114,9 +112,7 @@ def _eight_bits(image: np.ndarray, field: str, error: type[BadInput]) -> np.ndar
     return pixels
 
 
-def _score_hwp_v1(
-    pair: _Pair, protocol: Protocol, networks: Mapping[str, Network]
-) -> dict[str, float]:
+def _score_hwp_v1(pair: _Pair, protocol: Protocol = HWP_V1) -> dict[str, float]:
     """The headline protocol, on the pixels that the hand covers fully."""
     region, cap, radius = pair.covered, protocol.psnr_cap, protocol.ssim.radius
     box = bounding_box(region).grown(protocol.box_padding).at_least(protocol.smallest_box)
@@ -135,14 +131,12 @@ def _score_hwp_v1(
         "psnr_edge": decibels(float(pair.error[pair.hand].mean()), cap),
         "ssim_full": _whole_frame_mean(similarity, box, region.shape, radius),
     }
-    for name, network in networks.items():
+    for name, network in pair.networks.items():
         scores[f"lpips_{name}"] = _lpips(pair, region, box, protocol, network)
     return scores
 
 
-def _score_paper_wildghand(
-    pair: _Pair, protocol: Protocol, networks: Mapping[str, Network]
-) -> dict[str, float]:
+def _score_paper_wildghand(pair: _Pair, protocol: Protocol = PAPER_WILDGHAND) -> dict[str, float]:
     """The released evaluator's settings, on the data set's mask."""
     box = bounding_box(pair.hand).grown(protocol.box_padding).at_least(protocol.smallest_box)
     region = crop(pair.hand, box)
@@ -151,15 +145,9 @@ def _score_paper_wildghand(
         "paper_psnr": decibels(float(pair.error.sum()) / pair.error.size, protocol.psnr_cap),
         "paper_ssim": ssim_box(x, y, region, protocol.ssim),
     }
-    if "alex" in networks:
-        scores["paper_lpips"] = _lpips(pair, pair.hand, box, protocol, networks["alex"])
+    if "alex" in pair.networks:
+        scores["paper_lpips"] = _lpips(pair, pair.hand, box, protocol, pair.networks["alex"])
     return scores
-
-
-_SCORERS = {
-    HWP_V1.name: _score_hwp_v1,
-    PAPER_WILDGHAND.name: _score_paper_wildghand,
-}
 
 
 def _on_black(image: np.ndarray, box: Box, region: np.ndarray) -> np.ndarray:
@@ -191,10 +179,6 @@ def _lpips(
     return network(_on_black(pair.prediction, box, inside), _on_black(pair.target, box, inside))
 
 
-#: Frames per worker that are read ahead; bounds the memory of a long list of frames.
-READ_AHEAD = 4
-
-
 @dataclass(frozen=True, eq=False)
 class Frame:
     """One frame to score."""
@@ -219,42 +203,17 @@ class FrameScore:
     #: Why the prediction failed; None where it did not.
     failure: str | None = None
 
-    @property
-    def empty(self) -> bool:
-        """True where the mask leaves no pixel to score; this does not depend on the prediction."""
-        return not self.values
-
 
 def score_frames(
-    frames: Iterable[Frame | Callable[[], Frame]],
-    protocols: Iterable[Protocol] = PROTOCOLS,
+    frames: Iterable[Frame],
     *,
     networks: Mapping[str, Network] | None = None,
     workers: int | None = None,
-) -> Iterator[FrameScore]:
-    """Score frames in parallel and yield the results in the order of the frames."""
-    chosen = tuple(protocols)
-    available = dict(networks or {})
-
-    def work(item: Frame | Callable[[], Frame]) -> FrameScore:
-        return _score(item if isinstance(item, Frame) else item(), chosen, available)
-
+) -> list[FrameScore]:
+    """Score frames in parallel."""
     _keep_freed_memory()
-    count = workers or os.cpu_count() or 1
-    if count == 1:
-        yield from map(work, frames)
-        return
-    pool = ThreadPoolExecutor(count, thread_name_prefix="score")
-    pending: deque[Future[FrameScore]] = deque()
-    try:
-        for item in frames:
-            pending.append(pool.submit(work, item))
-            if len(pending) > READ_AHEAD * count:
-                yield pending.popleft().result()
-        while pending:
-            yield pending.popleft().result()
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+    with ThreadPoolExecutor(workers or os.cpu_count(), thread_name_prefix="score") as pool:
+        return list(pool.map(partial(_score, networks=networks or {}), frames))
 
 
 def _keep_freed_memory() -> None:
@@ -267,34 +226,24 @@ def _keep_freed_memory() -> None:
     np.empty(31 * 2**20, np.uint8)
 
 
-def _score(
-    frame: Frame, protocols: tuple[Protocol, ...], networks: Mapping[str, Network]
-) -> FrameScore:
+def _score(frame: Frame, networks: Mapping[str, Network]) -> FrameScore:
     check_truth(frame.target, frame.mask)
-    prediction = frame.prediction
-    failure: HwpError | None = None
-    if isinstance(prediction, HwpError):
-        # The mask is still checked first: a frame without a hand is not a failure of the method.
-        failure, prediction = prediction, frame.target
-    else:
-        try:
-            check_prediction(prediction, frame.target)
-        except HwpError as error:
-            failure, prediction = error, frame.target
+    prediction, failure = frame.prediction, None
+    try:
+        if isinstance(prediction, HwpError):
+            raise prediction
+        check_prediction(prediction, frame.target)
+    except HwpError as error:
+        # The mask is still checked: a frame without a hand is not a failure of the method.
+        failure, prediction = str(error), frame.target
+    coverage, asked = frame.coverage, {} if failure else networks
     try:
         values = score_frame(
-            prediction,
-            frame.target,
-            frame.mask,
-            protocols,
-            coverage=frame.coverage,
-            networks={} if failure else networks,
+            prediction, frame.target, frame.mask, coverage=coverage, networks=asked
         )
     except EmptyMask:
         return FrameScore({})
-    if failure is not None:
-        return FrameScore(penalty(protocols, networks), str(failure))
-    return FrameScore(values)
+    return FrameScore(penalty(networks) if failure else values, failure)
 
 
 Scores = dict[str, float]
@@ -340,7 +289,6 @@ class Summary:
 class Aggregate:
     """The summaries that tables are made of."""
 
-    #: Over all captures.
     overall: Summary
     #: Over the captures of one hand; None if there are none.
     single: Summary | None = None
@@ -382,13 +330,12 @@ def _summarize(captures: Sequence[CaptureScores]) -> Summary:
     perturbations = {
         name: mean_scores(means[c.id] for c in by_id if name in c.perturbations) for name in names
     }
-    frames = [row for capture in by_id for row in capture.frames.values()]
     return Summary(
         captures=means,
         perturbations=perturbations,
         macro=mean_scores(perturbations.values()),
         capture_mean=mean_scores(means.values()),
-        micro=mean_scores(frames),
+        micro=mean_scores(row for capture in by_id for row in capture.frames.values()),
     )
 
 
@@ -396,30 +343,22 @@ def _check(captures: Sequence[CaptureScores]) -> None:
     if not captures:
         raise BadResult("there are no captures to average", field="captures")
     seen: set[str] = set()
-    metrics: frozenset[str] | None = None
+    metrics: set[str] | None = None
     for capture in captures:
         if capture.id in seen:
             raise BadResult("is listed twice", where=capture.id, field="id")
         seen.add(capture.id)
         if not capture.frames:
-            raise BadResult(
-                "has no scored frame",
-                where=capture.id,
-                field="frames",
-                remedy="Every capture of a result must have at least one frame with a hand.",
-            )
+            remedy = "Every capture of a result must have at least one frame with a hand."
+            raise BadResult("has no scored frame", where=capture.id, field="frames", remedy=remedy)
         for frame, row in capture.frames.items():
-            names = frozenset(row)
-            metrics = names if metrics is None else metrics
-            if names != metrics or not names:
-                odd = ", ".join(sorted(names ^ metrics)) or "none at all"
-                raise BadResult(
-                    f"its metrics differ from the other frames' ({odd})",
-                    where=capture.id,
-                    field=f"frames[{frame}]",
-                )
+            place = f"frames[{frame}]"
+            metrics = set(row) if metrics is None else metrics
+            if set(row) != metrics or not row:
+                odd = ", ".join(sorted(set(row) ^ metrics)) or "none at all"
+                problem = f"its metrics differ from the other frames' ({odd})"
+                raise BadResult(problem, where=capture.id, field=place)
             for name, score in row.items():
                 if not math.isfinite(score):
-                    raise BadResult(
-                        f"the score is {score}", where=capture.id, field=f"frames[{frame}].{name}"
-                    )
+                    problem = f"the score is {score}"
+                    raise BadResult(problem, where=capture.id, field=f"{place}.{name}")

@@ -240,27 +240,16 @@ def _draw_front(
         )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Bar:
-    """One method in one group of bars."""
-
-    #: Number of the method, for its colour.
-    method: int
-    #: Its mean and interval.
-    estimate: Estimate
-
-
-def draw_bars(groups: Mapping[str, Sequence[Bar]], metric: str) -> Figure:
-    """Draw one group of bars a perturbation, each with its 95 % interval.
+def draw_bars(groups: Mapping[str, Sequence[Estimate]], metric: str) -> Figure:
+    """Draw one group of bars a perturbation, one a method, each with its 95 % interval.
 
     Bars begin at zero; an interval that leaves the figure is cut there, and has no end mark.
     """
     digits = metric_facts(metric).digits
-    values = [bar.estimate.value for bars in groups.values() for bar in bars]
-    ends = [bar.estimate.high for bars in groups.values() for bar in bars]
-    top = max([*values, 1e-9])
-    high = min(max([top, *(end for end in ends if end is not None)]), 1.35 * top)
-    height = 24.0 * len(groups) + 14.0 * len(values)
+    every = [estimate for bars in groups.values() for estimate in bars]
+    top = max([*(estimate.value for estimate in every), 1e-9])
+    high = min(max([top, *(one.high for one in every if one.high is not None)]), 1.35 * top)
+    height = 24.0 * len(groups) + 14.0 * len(every)
     with figure_style():
         figure = new_figure(height)
         axes = add_axes(figure, 8, 0, WIDTH - 70, height)
@@ -270,9 +259,9 @@ def draw_bars(groups: Mapping[str, Sequence[Bar]], metric: str) -> Figure:
         for title, bars in groups.items():
             axes.text(0, place + 14, title, size=12, weight="bold")
             place += 20
-            for bar in bars:
-                _draw_bar(axes, bar, place + 5.5, high)
-                text = f"{bar.estimate.value:.{digits}f}"
+            for number, estimate in enumerate(bars):
+                _draw_bar(axes, estimate, PALETTE[f"s{number % SERIES}"], place + 5.5, high)
+                text = f"{estimate.value:.{digits}f}"
                 axes.annotate(
                     text, (1, place + 5.5), (60, 0), textcoords="offset points", ha="right",
                     xycoords=axes.get_yaxis_transform(), va="center", color=PALETTE["faint"],
@@ -282,10 +271,8 @@ def draw_bars(groups: Mapping[str, Sequence[Bar]], metric: str) -> Figure:
     return figure
 
 
-def _draw_bar(axes: Axes, bar: Bar, middle: float, high: float) -> None:
-    estimate = bar.estimate
+def _draw_bar(axes: Axes, estimate: Estimate, color: str, middle: float, high: float) -> None:
     shown = float(np.clip(estimate.value, 0.002 * high, high))
-    color = PALETTE[f"s{bar.method % SERIES}"]
     axes.barh(middle, shown, height=11, color=color, gid=f"{MARK}bar")
     if estimate.low is not None and estimate.high is not None:
         reach = np.clip([estimate.low, estimate.high], 0, high)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import base64
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from importlib import resources
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import cv2
 import numpy as np
@@ -24,7 +24,7 @@ from hwp_bench.analysis.compare import (
     standings,
     standings_table,
 )
-from hwp_bench.analysis.cost import CostAnalysis, analyse_cost
+from hwp_bench.analysis.cost import PLAIN, CostAnalysis, analyse_cost
 from hwp_bench.analysis.pairing import MethodRuns, group_runs, refuse_unlike, scopes
 from hwp_bench.base.arrays import evenly
 from hwp_bench.base.drawing import fitted, labelled, sheet
@@ -35,7 +35,6 @@ from hwp_bench.base.tables import Table
 from hwp_bench.capture.schema import CaptureInfo
 from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.report.figures import (
-    Bar,
     StripMethod,
     draw_bars,
     draw_pareto,
@@ -65,6 +64,8 @@ from hwp_bench.taxonomy import PERTURBATIONS, perturbation
 if TYPE_CHECKING:
     from jinja2 import Environment
 
+T = TypeVar("T")
+
 #: Name of the page.
 PAGE = "index.html"
 
@@ -87,12 +88,9 @@ def template_environment(package: str) -> Environment:
     """
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
+    loader, strict = PackageLoader(package), StrictUndefined
     environment = Environment(
-        loader=PackageLoader(package),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
+        loader=loader, autoescape=True, undefined=strict, trim_blocks=True, lstrip_blocks=True
     )
     environment.filters["unbroken"] = _unbroken
     environment.globals.update({"series_classes": series_classes, "column_groups": _column_groups})
@@ -109,17 +107,6 @@ def _column_groups(table: Table) -> list[tuple[str, int]]:
     return [(group, len(list(own))) for group, own in groupby(c.group for c in table.columns)]
 
 
-def render_report(report: ReportPage, title: str) -> str:
-    """Return the page of a report."""
-    return render_template(
-        "hwp_bench.report",
-        "report.html.j2",
-        report=report,
-        title=title,
-        style=style_sheet(),
-    )
-
-
 def write_report(
     folder: Path,
     sources: Sequence[ResultsSource],
@@ -134,7 +121,12 @@ def write_report(
     report = gather_report(sources, captures, base=base, avatar_pages=pages)
     titles = dict.fromkeys(source.results.method.title for source in sources)
     heading = title or "HWP bench: " + ", ".join(titles)
-    return atomic_write(folder / PAGE, render_report(report, heading))
+    return _write(folder, "report.html.j2", title=heading, report=report)
+
+
+def _write(folder: Path, template: str, **values: Any) -> Path:
+    text = render_template("hwp_bench.report", template, style=style_sheet(), **values)
+    return atomic_write(folder / PAGE, text)
 
 
 def provenance(result: Results) -> dict[str, str]:
@@ -206,23 +198,17 @@ MASKS, MASK_EDGE = 6, 160
 
 
 class Album:
-    """Collects images until the budget is spent.
-
-    Attributes:
-        left: bytes that are left.
-        left_out: how many images the budget did not allow.
-    """
+    """Turns images into data URIs until the budget of bytes (`left`) is spent."""
 
     def __init__(self, budget: int = MAX_BYTES) -> None:
         self.left = budget
+        #: How many images the budget did not allow.
         self.left_out = 0
 
-    def take(self, pixels: np.ndarray) -> str | None:
-        """Return an image as a data URI, or None where the budget does not allow it.
-
-        Args:
-            pixels: (H, W, 3) uint8.
-        """
+    def take(self, pixels: np.ndarray | None) -> str | None:
+        """Return a (H, W, 3) uint8 image as a data URI; None without one, or beyond the budget."""
+        if pixels is None:
+            return None
         if max(pixels.shape[:2]) > EDGE:
             pixels = fitted(pixels, EDGE)
         done, data = cv2.imencode(
@@ -235,21 +221,6 @@ class Album:
         self.left -= len(uri)
         return uri
 
-    def take_file(self, path: Path | None) -> str | None:
-        """Return an image file as a data URI; None if it is missing or beyond the budget."""
-        pixels = _read_picture(path)
-        return None if pixels is None else self.take(pixels)
-
-
-def frame_sheets(source: ResultsSource, capture: str, album: Album) -> str | None:
-    """Return the sheet of worst, median and best frame that the evaluation drew."""
-    return album.take_file(source.place(capture, "pictures", "comparison.png"))
-
-
-def free_view_sheet(source: ResultsSource, capture: str, album: Album) -> str | None:
-    """Return the sheet of views of the free-view clip that the evaluation drew."""
-    return album.take_file(source.place(capture, "pictures", "free_view.png"))
-
 
 def mask_sheet(source: ResultsSource, capture: str, album: Album) -> tuple[str, int] | None:
     """Return a sheet of a method's weight masks and how many there are, or None.
@@ -260,13 +231,9 @@ def mask_sheet(source: ResultsSource, capture: str, album: Album) -> tuple[str, 
     if folder is None or not folder.is_dir():
         return None
     files = sorted(path for path in folder.iterdir() if re.fullmatch(r"\d{6}\.png", path.name))
-    if not files:
-        return None
-    tiles = []
-    for path in (files[index] for index in evenly(len(files), MASKS)):
-        pixels = _read_picture(path)
-        if pixels is not None:
-            tiles.append(labelled(fitted(pixels, MASK_EDGE), f"frame {int(path.stem)}"))
+    shown = [files[index] for index in evenly(len(files), MASKS)] if files else []
+    read = [(path, pixels) for path in shown if (pixels := _read_picture(path)) is not None]
+    tiles = [labelled(fitted(pixels, MASK_EDGE), f"frame {int(p.stem)}") for p, pixels in read]
     uri = album.take(sheet(tiles, columns=3)) if tiles else None
     return (uri, len(files)) if uri else None
 
@@ -283,58 +250,6 @@ def _read_picture(path: Path | None) -> np.ndarray | None:
 
 #: The metric of the plots and of the summary sentence.
 HEADLINE = "psnr"
-#: Name of the plain baseline, which others are compared with where it is among them.
-PLAIN = "plain"
-
-
-@dataclass(frozen=True)
-class CaptureSection:
-    """One capture on the page."""
-
-    #: Its id.
-    id: str
-    #: Its facts, in words.
-    facts: str
-    #: Its strip.
-    strip: Markup
-    #: Whether severities are known.
-    severities: bool
-    #: Sheets of worst, median and best frame: (method, data URI).
-    frames: Sequence[tuple[str, str]]
-    #: Sheets of views from all around: (method, data URI).
-    views: Sequence[tuple[str, str]]
-    #: Sheets of weight masks: (method, data URI, number of masks).
-    masks: Sequence[tuple[str, str, int]]
-    #: Pages of avatars: (method, address).
-    avatars: Sequence[tuple[str, str]]
-
-
-@dataclass(frozen=True)
-class ReportPage:
-    """Everything on the page."""
-
-    #: One or two sentences that say what the results say.
-    summary: str
-    #: Labels of the methods, in the order of their colours.
-    methods: Sequence[str]
-    #: Tables: the first few of everything, then those that need more.
-    tables: Sequence[Table]
-    #: Score over seconds, or None without curves.
-    pareto: Markup | None
-    #: Tables of accuracy against time.
-    cost_tables: Sequence[Table]
-    #: Bars by perturbation, or None where no capture has one.
-    bars: Markup | None
-    #: Tables of differences with intervals.
-    differences: Sequence[Table]
-    #: One entry a capture.
-    captures: Sequence[CaptureSection]
-    #: One row a result: what it was made with.
-    provenance: Sequence[Mapping[str, str]]
-    #: Digests of captures, splits and predictions.
-    digests: Sequence[Mapping[str, str]]
-    #: Images for which the page had no space left.
-    left_out: int
 
 
 def gather_report(
@@ -342,51 +257,64 @@ def gather_report(
     capture_folders: Sequence[str | os.PathLike[str]] = (),
     *,
     base: str | None = None,
-    image_bytes: int | None = None,
+    image_bytes: int = MAX_BYTES,
     avatar_pages: AvatarPages | None = None,
-) -> ReportPage:
-    """Gather a report."""
+) -> dict[str, Any]:
+    """Return what the template shows, by name."""
     if not sources:
         raise UsageError("results are needed", field="RESULTS")
     results = [source.results for source in sources]
     same_data(results)
     chosen = [s for s in sources if s.results.frames == "perturbed"] or list(sources)
-    runs = group_runs([source.results for source in chosen])
+    measured = [source.results for source in chosen]
+    runs = group_runs(measured)
     refuse_unlike(runs)
     infos = find_captures(results, capture_folders)
-    album = Album() if image_bytes is None else Album(image_bytes)
-    order = {run.label: index for index, run in enumerate(runs)}
-    start = base or next((r.first.method.name for r in runs if r.first.method.name == PLAIN), None)
-    cost = _cost(runs)
-    tables = all_tables([source.results for source in chosen])
-    shown = [tables["overall"]]
-    shown += _optional(lambda: rank_table(runs) if len(runs) > 1 else None)
-    shown += [tables[name] for name in ("perturbations", "captures")]
-    shown += _optional(lambda: free_view_table([source.results for source in chosen]))
-    shown.append(replace(tables["paper"], caption="Protocol paper-wildghand"))
-    shown += _optional(
-        lambda: robustness_table(sources, start),
-        lambda: severity_table(chosen, infos),
-        lambda: bias_table(chosen, infos),
-        lambda: _seeds(chosen, runs),
-    )
-    return ReportPage(
-        summary=summary_sentence(runs),
-        methods=list(order),
-        tables=[add_isolation_note(table, results) for table in shown if len(table.columns) > 1],
-        pareto=_pareto(cost, order) if cost else None,
-        cost_tables=[add_isolation_note(table, results) for table in cost.tables.values()]
-        if cost
-        else [],
-        bars=_bars(runs),
-        differences=[add_isolation_note(table, results) for table in _differences(runs)],
-        captures=_captures(
-            chosen, runs, infos, album, _by_label(avatar_pages or {}, sources, runs)
-        ),
-        provenance=[provenance(result) for result in results],
-        digests=[row for result in results for row in _digests(result)],
-        left_out=album.left_out,
-    )
+    album = Album(image_bytes)
+    plain = next((PLAIN for run in runs if run.first.method.name == PLAIN), None)
+    cost = _optional(lambda: analyse_cost(runs, HEADLINE))
+    several = any(len(run.seeds) > 1 for run in runs)
+    tables = all_tables(measured)
+    shown = [
+        tables["overall"],
+        _optional(lambda: rank_table(runs)) if len(runs) > 1 else None,
+        tables["perturbations"],
+        tables["captures"],
+        _optional(lambda: free_view_table(measured)),
+        replace(tables["paper"], caption="Protocol paper-wildghand"),
+        _optional(lambda: robustness_table(sources, base or plain)),
+        _optional(lambda: severity_table(chosen, infos)),
+        _optional(lambda: bias_table(chosen, infos)),
+        _optional(lambda: seeds_table(chosen)) if several else None,
+    ]
+
+    def noted(found: Iterable[Table | None]) -> list[Table]:
+        return [add_isolation_note(one, results) for one in found if one and len(one.columns) > 1]
+
+    return {
+        "summary": summary_sentence(runs),
+        "methods": [run.label for run in runs],
+        "tables": noted(shown),
+        "pareto": _pareto(cost, runs) if cost else None,
+        "cost_tables": noted(cost.tables.values() if cost else ()),
+        "bars": _bars(runs),
+        "differences": noted(_optional(lambda: _differences(runs)) or ()),
+        "captures": _captures(chosen, runs, infos, album, sources, avatar_pages or {}),
+        "provenance": [provenance(result) for result in results],
+        "digests": [
+            {
+                "method": f"{result.method.title}, seed {result.seed}",
+                "capture": capture.id,
+                "made_by": capture.made_by or "",
+                "data": capture.digest,
+                "split": capture.split_digest,
+                "predictions": capture.predictions_digest,
+            }
+            for result in results
+            for capture in result.captures
+        ],
+        "left_out": album.left_out,
+    }
 
 
 def summary_sentence(runs: Sequence[MethodRuns]) -> str:
@@ -412,49 +340,30 @@ def summary_sentence(runs: Sequence[MethodRuns]) -> str:
     return f"{text}.{tail}"
 
 
-def _cost(runs: Sequence[MethodRuns]) -> CostAnalysis | None:
+def _optional(make: Callable[[], T]) -> T | None:
+    """Return what is made of results that hold enough for it, else None."""
     try:
-        return analyse_cost(runs, HEADLINE)
+        return make()
     except UsageError:
-        # No method left a curve; everything else can be shown all the same.
         return None
 
 
-def _optional(*makers: Callable[[], Table | None]) -> list[Table]:
-    """Return the tables that these results hold enough for."""
-    found = []
-    for make in makers:
-        try:
-            table = make()
-        except UsageError:
-            continue
-        found += [table] if table is not None else []
-    return found
-
-
-def _seeds(chosen: Sequence[ResultsSource], runs: Sequence[MethodRuns]) -> Table | None:
-    return seeds_table(chosen) if any(len(run.seeds) > 1 for run in runs) else None
-
-
-def _pareto(cost: CostAnalysis, order: Mapping[str, int]) -> Markup:
+def _pareto(cost: CostAnalysis, runs: Sequence[MethodRuns]) -> Markup:
+    order = {run.label: index for index, run in enumerate(runs)}
     figure = draw_pareto(cost.curves, cost.front, HEADLINE, order)
     return inline_svg(figure, f"{metric_facts(HEADLINE).label} over seconds of fitting")
 
 
 def _bars(runs: Sequence[MethodRuns]) -> Markup | None:
+    """Draw the mean of each method and perturbation; None where no capture has one."""
     groups = {}
     for name, weights in scopes(runs[0].first).items():
         if name in PERTURBATIONS:
+            samples = [
+                [run.values(c, HEADLINE, sorted(run.seeds)) for c in weights] for run in runs
+            ]
             groups[perturbation(name).heading] = [
-                Bar(
-                    index,
-                    bootstrap_mean(
-                        [run.values(c, HEADLINE, sorted(run.seeds)) for c in weights],
-                        list(weights.values()),
-                        resamples=2000,
-                    ),
-                )
-                for index, run in enumerate(runs)
+                bootstrap_mean(own, list(weights.values()), resamples=2000) for own in samples
             ]
     if not groups:
         return None
@@ -465,80 +374,56 @@ def _bars(runs: Sequence[MethodRuns]) -> Markup | None:
 def _differences(runs: Sequence[MethodRuns]) -> list[Table]:
     if len(runs) < 2:
         return []
-    try:
-        found = compare(runs, HEADLINE)
-    except UsageError:
-        # No seed in common.
-        return []
+    found = compare(runs, HEADLINE)
     return [
         standings_table(HEADLINE, standings(runs, HEADLINE, found)),
         differences_table(HEADLINE, found),
     ]
 
 
-def _by_label(
-    pages: AvatarPages, sources: Sequence[ResultsSource], runs: Sequence[MethodRuns]
-) -> dict[tuple[str, str], str]:
-    """Addresses by label and capture, of the results that stand for their methods."""
-    labels = {id(run.first): run.label for run in runs}
-    return {
-        (labels[id(sources[index].results)], capture): address
-        for (index, capture), address in pages.items()
-        if id(sources[index].results) in labels
-    }
-
-
 def _captures(
-    sources: Sequence[ResultsSource],
+    chosen: Sequence[ResultsSource],
     runs: Sequence[MethodRuns],
     infos: Mapping[str, CaptureInfo],
     album: Album,
-    pages: Mapping[tuple[str, str], str],
-) -> list[CaptureSection]:
-    first = {run.label: run.first for run in runs}
+    sources: Sequence[ResultsSource],
+    pages: AvatarPages,
+) -> list[dict[str, Any]]:
+    """Return the sections of the captures: facts, strip, and pictures by method."""
+    places = {id(source.results): place for place, source in enumerate(sources)}
     shown = [
-        (label, source) for label, f in first.items() for source in sources if source.results is f
+        (run.label, source) for run in runs for source in chosen if source.results is run.first
     ]
     sections = []
     for capture in runs[0].first.captures:
         info = infos.get(capture.digest)
-        methods, frames, views, masks, avatars = [], [], [], [], []
-        for index, (label, source) in enumerate(shown):
+        methods: list[StripMethod] = []
+        found: dict[str, list[tuple[Any, ...]]] = {
+            name: [] for name in ("frames", "views", "masks", "avatars")
+        }
+        for label, source in shown:
             own = next(c for c in source.results.captures if c.id == capture.id)
             weights = sound_temporal_weights(source, capture.id)
-            methods.append(StripMethod(index, label, own, weights))
-            if uri := frame_sheets(source, capture.id, album):
-                frames.append((label, uri))
-            if uri := free_view_sheet(source, capture.id, album):
-                views.append((label, uri))
-            if found := mask_sheet(source, capture.id, album):
-                masks.append((label, *found))
-            if address := pages.get((label, capture.id)):
-                avatars.append((label, address))
+            methods.append(StripMethod(len(methods), label, own, weights))
+            for name, file in (("frames", "comparison.png"), ("views", "free_view.png")):
+                picture = _read_picture(source.place(capture.id, "pictures", file))
+                if uri := album.take(picture):
+                    found[name].append((label, uri))
+            if masks := mask_sheet(source, capture.id, album):
+                found["masks"].append((label, *masks))
+            if address := pages.get((places[id(source.results)], capture.id)):
+                found["avatars"].append((label, address))
         hands = "two hands" if capture.hands == "both" else f"{capture.hands} hand"
         carried = ", ".join(perturbation(name).title for name in capture.perturbations)
         text = f"{hands}; {carried or 'no perturbation'}"
         if info:
             text = f"{info.action}: {text}; {info.frame_count} frames, {info.width}x{info.height}"
         strip = strip_plot(methods, info, HEADLINE)
+        known = info is not None
         sections.append(
-            CaptureSection(capture.id, text, strip, info is not None, frames, views, masks, avatars)
+            {"id": capture.id, "facts": text, "strip": strip, "severities": known, **found}
         )
     return sections
-
-
-def _digests(result: Results) -> list[dict[str, str]]:
-    return [
-        {
-            "method": f"{result.method.title}, seed {result.seed}",
-            "capture": capture.id,
-            "made_by": capture.made_by or "",
-            "data": capture.digest,
-            "split": capture.split_digest,
-            "predictions": capture.predictions_digest,
-        }
-        for capture in result.captures
-    ]
 
 
 def write_reports(
@@ -552,41 +437,27 @@ def write_reports(
 ) -> list[Path]:
     """Write the report of some results, or one report for each of the data that they are on."""
     groups = data_groups(sources, oracles=True)
+
+    def write(place: Path, own: Sequence[ResultsSource], base: str | None) -> Path:
+        return write_report(place, own, captures, base=base, title=title, avatar_pages=avatar_pages)
+
     if len(groups) < 2:
-        only = write_report(
-            folder, sources, captures, base=base, title=title, avatar_pages=avatar_pages
-        )
-        return [only]
+        return [write(folder, sources, base)]
     names = [{source.results.method.name for source in group.sources} for group in groups]
     if base is not None and not any(base in known for known in names):
         raise UsageError(f"no result is of {base!r}", field="--base")
     pages, rows = [], []
     for group, known in zip(groups, names, strict=True):
-        shown = base if base in known else None
-        page = write_report(
-            folder / group.label,
-            group.sources,
-            captures,
-            base=shown,
-            title=title,
-            avatar_pages=avatar_pages,
-        )
-        pages.append(page)
-        perturbed = [s.results for s in group.sources if s.results.frames == "perturbed"]
+        pages.append(write(folder / group.label, group.sources, base if base in known else None))
+        results = [source.results for source in group.sources]
         rows.append(
             {
                 "address": f"{group.label}/{PAGE}",
                 "label": group.label,
                 "text": group.text,
-                "methods": ", ".join(dict.fromkeys(s.results.method.title for s in group.sources)),
-                "verdict": winner_note(perturbed) or "",
+                "methods": ", ".join(dict.fromkeys(result.method.title for result in results)),
+                "verdict": winner_note([r for r in results if r.frames == "perturbed"]) or "",
             }
         )
-    text = render_template(
-        "hwp_bench.report",
-        "mixed.html.j2",
-        title=title or "HWP bench: results on different data",
-        style=style_sheet(),
-        rows=rows,
-    )
-    return [atomic_write(folder / PAGE, text), *pages]
+    heading = title or "HWP bench: results on different data"
+    return [_write(folder, "mixed.html.j2", title=heading, rows=rows), *pages]

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
 
 from hwp_bench.analysis.pairing import MethodRuns
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.tables import Cell, Column, Table, without_empty_columns
 from hwp_bench.metrics import metric as metric_facts
-from hwp_bench.metrics.score import Scores, Summary, aggregate, mean_scores
-from hwp_bench.results.published import MARK, NOTE, Measurement, PublishedTable, read_published
+from hwp_bench.metrics.score import Scores, aggregate, mean_scores
+from hwp_bench.results.published import MARK, NOTE, Measurement, read_published
 from hwp_bench.results.schema import score_rows
 from hwp_bench.taxonomy import PERTURBATIONS, catalogue, perturbation
 
@@ -69,33 +72,60 @@ LAYOUTS: Mapping[int, Layout] = {
 
 def fact_table(number: int) -> Table:
     """Return table 1 (data sets, as published) or 2 (the captures); neither has measurements."""
+    published = read_published()
     names = [perturbation(name).title for name in PERTURBATIONS]
-    if number == 1:
-        keys = ("clean_test", "single", "interacting", *PERTURBATIONS)
-        heads = ("Data set", "Environment", "Clean test", "Single", "Interacting", *names)
-        rows = tuple(
-            (item.name, item.environment, *_ticks(key in item.has for key in keys))
-            for item in read_published().datasets
-        )
-        note = f"Published in {read_published().title}, table 1."
-        return Table("Hand video data sets", tuple(map(Column, heads)), rows, (note,))
-    heads = ("Capture", "Hand", "Action", "Device", "Frames", *names)
-    rows = tuple(
-        (
-            entry.id,
-            entry.hands,
-            entry.action,
-            entry.device,
-            str(entry.frame_count),
-            *_ticks(name in entry.perturbations for name in PERTURBATIONS),
-        )
-        for entry in catalogue().values()
-    )
-    return Table("The captures of the HWP data set", tuple(map(Column, heads)), rows)
+    keys = ("clean_test", "single", "interacting", *PERTURBATIONS)
+    heads = ["Data set", "Environment", "Clean test", "Single", "Interacting", *names]
+    caption, notes = "Hand video data sets", (f"Published in {published.title}, table 1.",)
+    rows = [
+        (item.name, item.environment, *_ticks(key in item.has for key in keys))
+        for item in published.datasets
+    ]
+    if number == 2:
+        heads = ["Capture", "Hand", "Action", "Device", "Frames", *names]
+        caption, notes = "The captures of the HWP data set", ()
+        rows = [
+            (
+                *(entry.id, entry.hands, entry.action, entry.device, str(entry.frame_count)),
+                *_ticks(name in entry.perturbations for name in PERTURBATIONS),
+            )
+            for entry in catalogue().values()
+        ]
+    return Table(caption, tuple(map(Column, heads)), tuple(rows), notes)
 
 
 def _ticks(present: Iterable[bool]) -> list[str]:
     return ["✓" if here else "" for here in present]
+
+
+#: The cells of a row.
+Row = tuple[Cell, ...]
+
+
+def _layout(
+    number: int,
+    caption: str,
+    columns: Iterable[Column],
+    rows: Sequence[Row],
+    published: Sequence[Row],
+    notes: Sequence[str],
+    **options: Any,
+) -> Table:
+    """Return a table with its published rows, which are never ranked, under the measured ones."""
+    count, every = len(rows), (*rows, *published)
+    if published:
+        page = read_published().table(number).page
+        source = f"table {number}, page {page}" if page and number <= 8 else f"table {number}"
+        notes = [*notes, f"{NOTE} Source: {source}."]
+    return Table(
+        f"{caption} (layout of table {number})",
+        tuple(columns),
+        every,
+        tuple(notes),
+        breaks=(count,) if 0 < count < len(every) else (),
+        unranked=frozenset(range(count, len(every))),
+        **options,
+    )
 
 
 def layout_table(
@@ -114,51 +144,47 @@ def layout_table(
         for scope, heading in layout.scopes.items()
         if scope not in _ELSEWHERE or published
     }
-    table = read_published().table(layout.number)
-    metrics, columns = _metric_columns(runs, published)
+    metrics = _metrics(runs, published)
     components = layout.components if published else ()
     if marks:
         components = tuple(next(iter(marks.values())))
     heads = [Column("Variant" if layout.variants else "Method"), *map(Column, components)]
-    for heading in shown.values():
-        heads += [Column(c.title, c.digits, c.higher_is_better, heading) for c in columns]
-    rows: list[tuple[Cell, ...]] = []
+    heads += [_column(name, heading) for heading in shown.values() for name in metrics]
+    rows: list[Row] = []
     for run in runs:
         means = _means(run)
         there = (marks or {}).get(run.first.method.title, {})
         ticks = _ticks(there.get(name, False) for name in components)
         cells = [means.get(scope, {}).get(METRIC_OF.get(m, m)) for scope in shown for m in metrics]
         rows.append((run.label, *ticks, *cells))
-    measured = len(rows)
-    if published:
-        rows += _published_rows(table, list(shown), metrics, components)
-    page = f", page {table.page}" if table.page else ""
-    notes = _notes(runs)
-    notes += (f"{NOTE} Source: table {table.number}{page}.",) if published else ()
-    made = Table(
-        f"{layout.caption} (layout of table {layout.number})",
-        tuple(heads),
-        tuple(rows),
-        notes,
-        breaks=(measured,) if 0 < measured < len(rows) else (),
-        unranked=frozenset(range(measured, len(rows))),
-    )
-    return without_empty_columns(made)
+    found: list[Row] = []
+    scopes_of: dict[tuple[str, str], dict[str, Measurement]] = {}
+    for item in read_published().table(layout.number).measurements if published else ():
+        scopes_of.setdefault((item.method, item.detail), {})[item.scope] = item
+    for (method, detail), by_scope in scopes_of.items():
+        ticks = _ticks(name in detail.split(", ") for name in components)
+        label = method if components else f"{method} {detail}".strip()
+        scores = [by_scope[scope].scores if scope in by_scope else {} for scope in shown]
+        cells = [own.get(name) for own in scores for name in metrics]
+        found.append((f"{label} ({MARK})", *ticks, *cells))
+    table = _layout(layout.number, layout.caption, heads, rows, found, _notes(runs))
+    return without_empty_columns(table)
 
 
-def _metric_columns(runs: Sequence[MethodRuns], published: bool) -> tuple[list[str], list[Column]]:
-    """Return the metrics, published names where there are, and their columns."""
+def _metrics(runs: Sequence[MethodRuns], published: bool) -> list[str]:
+    """Return the metrics, under their published names where they have one."""
     known = [set(result.metrics) for run in runs for result in run.seeds.values()]
     lpips = bool(known) and all("paper_lpips" in names for names in known)
     metrics = ["psnr", "ssim", *(["lpips"] if lpips or published else [])]
     if not lpips and known and all(DISTANCE in names for names in known):
         metrics.append(DISTANCE)
-    columns = []
-    for name in metrics:
-        facts = metric_facts(METRIC_OF.get(name, name))
-        digits = PAPER_DIGITS.get(name, facts.digits)
-        columns.append(Column(facts.label, digits, facts.higher_is_better))
-    return metrics, columns
+    return metrics
+
+
+def _column(name: str, group: str = "") -> Column:
+    facts = metric_facts(METRIC_OF.get(name, name))
+    digits = PAPER_DIGITS.get(name, facts.digits)
+    return Column(facts.label, digits, facts.higher_is_better, group)
 
 
 def _means(run: MethodRuns) -> dict[str, Scores]:
@@ -166,116 +192,79 @@ def _means(run: MethodRuns) -> dict[str, Scores]:
     found: dict[str, list[Scores]] = {}
     for result in run.seeds.values():
         mean = aggregate(score_rows(result))
-        found.setdefault("all", []).append(mean.overall.capture_mean)
-        groups: dict[str, Summary | None] = {
-            "single": mean.single,
-            "interacting": mean.interacting,
-        }
-        for scope, summary in groups.items():
-            if summary is not None:
-                found.setdefault(scope, []).append(summary.capture_mean)
         # The paper's table by perturbation is only of interacting hands.
-        for name, scores in (mean.interacting.perturbations if mean.interacting else {}).items():
-            found.setdefault(name, []).append(scores)
+        scopes = dict(mean.interacting.perturbations) if mean.interacting else {}
+        groups = (("all", mean.overall), ("single", mean.single), ("interacting", mean.interacting))
+        scopes |= {name: summary.capture_mean for name, summary in groups if summary is not None}
+        for scope, scores in scopes.items():
+            found.setdefault(scope, []).append(scores)
     return {scope: mean_scores(rows) for scope, rows in found.items()}
 
 
-def _published_rows(
-    table: PublishedTable, scopes: Sequence[str], metrics: Sequence[str], components: Sequence[str]
-) -> list[tuple[Cell, ...]]:
-    rows: dict[tuple[str, str], dict[str, Measurement]] = {}
-    for item in table.measurements:
-        rows.setdefault((item.method, item.detail), {})[item.scope] = item
-    found = []
-    for (method, detail), by_scope in rows.items():
-        ticks = _ticks(name in detail.split(", ") for name in components)
-        label = method if components else f"{method} {detail}".strip()
-        cells = [
-            by_scope[scope].scores.get(name) if scope in by_scope else None
-            for scope in scopes
-            for name in metrics
-        ]
-        found.append((f"{label} ({MARK})", *ticks, *cells))
-    return found
-
-
-def _notes(runs: Sequence[MethodRuns]) -> tuple[str, ...]:
+def _notes(runs: Sequence[MethodRuns]) -> list[str]:
     if not runs:
-        return ()
+        return []
     first = runs[0].first
     seeds = max(len(run.seeds) for run in runs)
-    return (
+    return [
         f"Measured rows: {first.suite}, {len(first.captures)} captures, protocol paper-wildghand; "
         f"means over captures of means over test frames, over {seeds} seed(s).",
-    )
+    ]
 
 
 def seeds_layout(runs: Sequence[MethodRuns], published: bool = False) -> Table:
     """Return the layout of table 10: mean and standard deviation over seeds, in one cell."""
-    import numpy as np
 
-    metrics, columns = _metric_columns(runs, published)
-    rows: list[tuple[Cell, ...]] = []
+    def cell(mean: float, deviation: float | None) -> str:
+        return f"{mean:.4f}" + (f" ± {deviation:.4f}" if deviation is not None else "")
+
+    metrics = _metrics(runs, published)
+    rows: list[Row] = []
     for run in runs:
+        every = [aggregate(score_rows(one)).overall.capture_mean for one in run.seeds.values()]
         cells: list[Cell] = []
         for name in metrics:
-            key = METRIC_OF.get(name, name)
-            by_seed = [
-                aggregate(score_rows(result)).overall.capture_mean for result in run.seeds.values()
-            ]
-            if not all(key in means for means in by_seed):
-                cells.append(None)
-                continue
-            means = [found[key] for found in by_seed]
-            spread = float(np.std(means, ddof=1)) if len(means) > 1 else None
-            cells.append(_plus_minus(float(np.mean(means)), spread))
+            found = [means.get(METRIC_OF.get(name, name)) for means in every]
+            scores = [score for score in found if score is not None]
+            spread = float(np.std(scores, ddof=1)) if len(scores) > 1 else None
+            whole = len(scores) == len(every)
+            cells.append(cell(float(np.mean(scores)), spread) if whole else None)
         rows.append((run.label, *cells))
-    measured = len(rows)
-    table = read_published().table(10)
-    if published:
-        for item in table.measurements:
-            texts = [
-                _plus_minus(item.scores[name], item.deviations.get(name))
-                if name in item.scores
-                else None
+    told = [
+        (
+            f"{item.method} ({MARK})",
+            *(
+                cell(item.scores[name], item.deviations.get(name)) if name in item.scores else None
                 for name in metrics
-            ]
-            rows.append((f"{item.method} ({MARK})", *texts))
-    heads = (Column("Method"), *columns)
-    notes = (*_notes(runs), *((f"{NOTE} Source: table 10.",) if published else ()))
-    caption = "Mean and standard deviation over seeds (layout of table 10)"
-    breaks = (measured,) if 0 < measured < len(rows) else ()
-    return Table(caption, heads, tuple(rows), notes, ranked=False, breaks=breaks)
-
-
-def _plus_minus(mean: float, deviation: float | None) -> str:
-    return f"{mean:.4f} ± {deviation:.4f}" if deviation is not None else f"{mean:.4f}"
+            ),
+        )
+        for item in (read_published().table(10).measurements if published else ())
+    ]
+    heads = [Column("Method"), *map(_column, metrics)]
+    caption = "Mean and standard deviation over seeds"
+    return _layout(10, caption, heads, rows, told, _notes(runs), ranked=False)
 
 
 def bias_layout(
-    measured: Sequence[tuple[Cell, ...]], metrics: Sequence[str], published: bool = False
+    measured: Sequence[Row], metrics: Sequence[str], notes: Sequence[str], published: bool = False
 ) -> Table:
     """Return the layout of table 9."""
     names = {value: key for key, value in METRIC_OF.items()}
     heads = [Column("Capture"), Column("Disturbance")]
-    for name in metrics:
-        facts = metric_facts(name)
-        digits = PAPER_DIGITS.get(names.get(name, name), facts.digits)
-        heads.append(Column(facts.label, digits, facts.higher_is_better))
+    heads += [_column(names.get(name, name)) for name in metrics]
     heads.append(Column("Avg. T. Wt. [1e-3]", 3))
     several = len({row[3] for row in measured}) > 1
-    rows: list[tuple[Cell, ...]] = [
-        (f"{row[0]}, {row[3]}" if several else row[0], row[1], *row[4:]) for row in measured
+    rows = [(f"{row[0]}, {row[3]}" if several else row[0], row[1], *row[4:]) for row in measured]
+    told = [
+        (
+            f"{item.scope} ({MARK})",
+            item.detail,
+            *(item.scores.get(names.get(name, name)) for name in metrics),
+            item.scores["temporal_weight_e3"],
+        )
+        for item in (read_published().table(9).measurements if published else ())
     ]
-    count = len(rows)
-    if published:
-        for item in read_published().table(9).measurements:
-            scores = [item.scores.get(names.get(name, name)) for name in metrics]
-            label = f"{item.scope} ({MARK})"
-            rows.append((label, item.detail, *scores, item.scores["temporal_weight_e3"]))
-    if not rows:
+    if not rows and not told:
         raise UsageError("none of these methods left temporal weights", field="RESULTS")
-    notes = (f"{NOTE} Source: table 9.",) if published else ()
-    caption = "Mean temporal weight and perturbation level (layout of table 9)"
-    breaks = (count,) if 0 < count < len(rows) else ()
-    return Table(caption, tuple(heads), tuple(rows), notes, ranked=False, breaks=breaks)
+    caption = "Mean temporal weight and perturbation level"
+    return _layout(9, caption, heads, rows, told, notes, ranked=False)

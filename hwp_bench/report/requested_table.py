@@ -116,34 +116,30 @@ def _ours(request: TableRequest) -> Table:
 
 def _group_table(sources: Sequence[ResultsSource], request: TableRequest) -> Table:
     """Return the table of results on the same data."""
-    results = [source.results for source in sources]
-    match request.by:
+    results, by = [source.results for source in sources], request.by
+    match by:
         case "robustness":
             return robustness_table(sources, request.base)
-        case "seeds":
-            table = seeds_table(sources)
         case "rank":
             return rank_table(group_runs(results))
-        case "cost":
-            table = cost_table(group_runs(results))
-        case "severity":
-            found = severity_table(sources, find_captures(results, request.captures))
-            return over_seeds(found, results)
-        case "novelty":
-            found = novelty_table(sources, open_captures_of(results, request.captures))
-            return over_seeds(found, results)
-        case "outline":
-            found = outline_table(sources, open_captures_of(results, request.captures))
-            return over_seeds(found, results)
         case "free-view":
             return free_view_table(results)
         case "bias":
             return bias_table(sources, find_captures(results, request.captures))
+        case "severity":
+            table = severity_table(sources, find_captures(results, request.captures))
+        case "novelty" | "outline":
+            captures = open_captures_of(results, request.captures)
+            table = (novelty_table if by == "novelty" else outline_table)(sources, captures)
+        case "seeds":
+            table = seeds_table(sources)
+        case "cost":
+            table = cost_table(group_runs(results))
         case _:
-            table = over_seeds(all_tables(results)[request.by], results)
-    if request.by not in VERDICTS:
-        return table
-    sentence = winner_note(results)
+            table = all_tables(results)[by]
+    if by not in ("seeds", "cost"):
+        table = over_seeds(table, results)
+    sentence = winner_note(results) if by in VERDICTS else None
     return replace(table, notes=(sentence, *table.notes)) if sentence else table
 
 
@@ -152,10 +148,6 @@ def _paper(number: int, request: TableRequest) -> Table:
     results = [source.results for source in sources]
     same_data(results)
     runs = group_runs(results)
-    if number == 10:
-        return add_isolation_note(seeds_layout(runs, request.published), results)
-    if number == 9:
-        return add_isolation_note(_bias_layout(sources, request), results)
     marks = _marks(request.paths) if number == 6 else None
     if number == 6 and runs and not marks:
         raise UsageError(
@@ -163,9 +155,13 @@ def _paper(number: int, request: TableRequest) -> Table:
             field="RESULTS",
             remedy="Give the folder that `hwp-bench ablate` wrote.",
         )
-    return add_isolation_note(
-        layout_table(LAYOUTS[number], runs, request.published, marks), results
-    )
+    if number == 10:
+        table = seeds_layout(runs, request.published)
+    elif number == 9:
+        table = _bias_layout(sources, request)
+    else:
+        table = layout_table(LAYOUTS[number], runs, request.published, marks)
+    return add_isolation_note(table, results)
 
 
 def _bias_layout(sources: Sequence[ResultsSource], request: TableRequest) -> Table:
@@ -180,8 +176,7 @@ def _bias_layout(sources: Sequence[ResultsSource], request: TableRequest) -> Tab
     rows = bias_rows(sources, captures, names)
     if sources and not rows:
         raise refused_bias()
-    table = bias_layout(rows, names, request.published)
-    return replace(table, notes=(LEVEL_NOTE, *table.notes)) if rows else table
+    return bias_layout(rows, names, [LEVEL_NOTE] if rows else [], request.published)
 
 
 def _marks(paths: Sequence[str | os.PathLike[str]]) -> Marks:

@@ -33,22 +33,14 @@ def rank_table(runs: Sequence[MethodRuns]) -> Table:
     others = [name for name in common_metrics(runs, HEADLINE) if name != METRIC]
     by_label = {run.label: run for run in runs}
     ranks = ranking.ranks
-    behind = [item.behind for item in ranks]
-    less = "Less the first"
+    behind = [(b.value, b.low, b.high) if (b := item.behind) else (None,) * 3 for item in ranks]
+    ends = zip(("Difference", "Low", "High"), zip(*behind, strict=True), strict=True)
     columns: list[Filled] = [
         (Column("Method"), [item.standing.label for item in ranks]),
         (Column("Rank", 0, group="Rank"), [item.rank for item in ranks]),
         (Column("95 %", group="Rank"), [item.interval for item in ranks]),
         (score_column(METRIC), [item.standing.mean for item in ranks]),
-        (
-            Column("Difference", facts.digits, group=less),
-            [b.value if b else None for b in behind],
-        ),
-        (Column("Low", facts.digits, group=less), [b.low if b else None for b in behind]),
-        (
-            Column("High", facts.digits, group=less),
-            [b.high if b else None for b in behind],
-        ),
+        *((Column(title, facts.digits, group="Less the first"), own) for title, own in ends),
         (Column("Ties"), [item.standing.ties for item in ranks]),
     ]
     for name in others:
@@ -112,13 +104,13 @@ def on_front(
     """Return whether no other method is at least as good in as few seconds, and better in one."""
     if cost.fit_seconds is None:
         return False
-    for other, theirs in zip(costs, scores, strict=True):
-        if other is cost or other.fit_seconds is None:
-            continue
-        as_good = theirs >= score and other.fit_seconds <= cost.fit_seconds
-        if as_good and (theirs > score or other.fit_seconds < cost.fit_seconds):
-            return False
-    return True
+    mine = (-cost.fit_seconds, score)
+    others = [
+        (-other.fit_seconds, theirs)
+        for other, theirs in zip(costs, scores, strict=True)
+        if other is not cost and other.fit_seconds is not None
+    ]
+    return not any(o != mine and o[0] >= mine[0] and o[1] >= mine[1] for o in others)
 
 
 #: Metrics of the robustness table.
@@ -143,16 +135,16 @@ def robustness_table(sources: Sequence[ResultsSource], base: str | None = None) 
     columns: list[Filled] = [(Column("Method"), [run.first.method.title for run, _ in pairs])]
     for name in names:
         label, head = metric_facts(name).label, score_column(name)
+        base_score = macro_mean(start, name) if start else None
         scores = [(macro_mean(run, name), macro_mean(clean, name)) for run, clean in pairs]
         changes = [100 * (score - best) / abs(best) if best else None for score, best in scores]
         closed = [
-            _closed(run, start, name, *own) for (run, _), own in zip(pairs, scores, strict=True)
+            None if run is start else _closed(base_score, *own, higher=bool(head.higher_is_better))
+            for (run, _), own in zip(pairs, scores, strict=True)
         ]
+        perturbed_head = Column("Perturbed", head.digits, head.higher_is_better, label)
         columns += [
-            (
-                Column("Perturbed", head.digits, head.higher_is_better, label),
-                [score for score, _ in scores],
-            ),
+            (perturbed_head, [score for score, _ in scores]),
             (Column("Clean", head.digits, group=label), [best for _, best in scores]),
             (Column("Change [%]", 1, group=label), changes),
             (Column("Gap closed [%]", 1, True, label), closed),
@@ -169,13 +161,13 @@ def robustness_table(sources: Sequence[ResultsSource], base: str | None = None) 
 
 def _oracle(run: MethodRuns, runs: Sequence[MethodRuns]) -> MethodRuns | None:
     """Return the runs of the same method in the same state on clean frames of the same captures."""
-    data = [(c.id, c.split_digest) for c in run.first.captures]
-    for other in runs:
-        same = other.first.method == run.first.method and other.first.budget == run.first.budget
-        captures = [(c.id, c.split_digest) for c in other.first.captures]
-        if other.first.frames == "clean" and same and captures == data:
-            return other
-    return None
+
+    def state(result: Results) -> tuple[object, ...]:
+        captures = [(c.id, c.split_digest) for c in result.captures]
+        return result.method, result.budget, captures
+
+    same = (one for one in runs if state(one.first) == state(run.first))
+    return next((one for one in same if one.first.frames == "clean"), None)
 
 
 def _base(perturbed: Sequence[MethodRuns], name: str | None) -> MethodRuns | None:
@@ -190,15 +182,11 @@ def _base(perturbed: Sequence[MethodRuns], name: str | None) -> MethodRuns | Non
     )
 
 
-def _closed(
-    run: MethodRuns, start: MethodRuns | None, name: str, score: float, oracle: float
-) -> float | None:
+def _closed(base: float | None, score: float, oracle: float, *, higher: bool) -> float | None:
     """Return 100 (score - base) / (oracle - base); None without a base or a gap."""
-    if start is None or start is run:
+    if base is None or (oracle <= base if higher else oracle >= base):
         return None
-    base = macro_mean(start, name)
-    gap = oracle - base if metric_facts(name).higher_is_better else base - oracle
-    return 100 * (score - base) / (oracle - base) if gap > 0 else None
+    return 100 * (score - base) / (oracle - base)
 
 
 def severity_table(sources: Sequence[ResultsSource], captures: Mapping[str, CaptureInfo]) -> Table:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
-from pathlib import Path
 
 from hwp_bench.base.errors import BadResult
 from hwp_bench.base.files import read_json
@@ -26,7 +24,6 @@ NOTE = (
 class Measurement:
     """Published scores of one method in one scope."""
 
-    #: Name of the method.
     method: str
     #: A variant of the method, or a level of the perturbation; empty if neither.
     detail: str
@@ -45,11 +42,9 @@ class PublishedTable:
 
     #: Its number in the paper, in Arabic digits.
     number: int
-    #: Its label in the paper's source.
     label: str
     #: Its page in the paper, where known; the source file does not tell.
     page: int | None
-    #: Its caption.
     caption: str
     #: Its numbers, row by row, from left to right.
     measurements: list[Measurement]
@@ -59,7 +54,6 @@ class PublishedTable:
 class Dataset:
     """One row of the paper's comparison of data sets."""
 
-    #: Name of the data set.
     name: str
     #: `Lab` or `Wild`.
     environment: str
@@ -71,11 +65,9 @@ class Dataset:
 class Published:
     """All published numbers."""
 
-    #: Title of the paper.
     title: str
     #: Where it says its code and data are.
     url: str
-    #: Tables of measurements.
     tables: list[PublishedTable]
     #: The comparison of data sets (table 1).
     datasets: list[Dataset]
@@ -88,8 +80,7 @@ class Published:
         raise BadResult(f"table {number} holds no published measurements", field="number")
 
 
-def read_published(path: str | os.PathLike[str] | None = None) -> Published:
-    """Read published numbers."""
-    file = Path(path) if path is not None else data_folder("leaderboard") / "published.json"
-    value = read_json(file)
-    return parse_record(Published, without_schema(value, SCHEMA, where=file), where=file)
+def read_published() -> Published:
+    """Read the published numbers, which come with the toolkit."""
+    file = data_folder("leaderboard") / "published.json"
+    return parse_record(Published, without_schema(read_json(file), SCHEMA, where=file), where=file)

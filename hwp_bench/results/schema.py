@@ -5,10 +5,12 @@ A field that was added within a version has a default, which says what files wit
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
 import platform
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import metadata
@@ -53,17 +55,8 @@ ISOLATED = "namespaces"
 NEW_CACHES = "new for each run"
 #: Packages whose version can move a number.
 PACKAGES = (
-    "numpy",
-    "torch",
-    "numba",
-    "opencv-contrib-python-headless",
-    "scikit-image",
-    "OpenImageIO",
-    "scipy",
-    "trimesh",
-    "embreex",
-    "gsplat",
-    "lpips",
+    *("numpy", "torch", "numba", "opencv-contrib-python-headless", "scikit-image", "OpenImageIO"),
+    *("scipy", "trimesh", "embreex", "gsplat", "lpips"),
 )
 
 
@@ -71,7 +64,6 @@ PACKAGES = (
 class FrameResult:
     """The scores of one test frame."""
 
-    #: Index in the capture.
     frame: Annotated[int, Meta(ge=0, lt=MAX_FRAMES)]
     #: Score by metric; a failed frame has the declared penalties.
     scores: ScoreTable
@@ -103,7 +95,6 @@ class CurvePoint:
 class FreeViewResult:
     """The scores of the free-view clip of a capture, apart from those of its test frames."""
 
-    #: Digest of the clip.
     digest: Line
     #: Every frame of the clip, in order.
     frames: Annotated[list[FrameResult], Meta(max_length=MAX_FRAMES)]
@@ -115,15 +106,12 @@ class FreeViewResult:
 class CaptureResult:
     """One method on one capture."""
 
-    #: Id of the capture.
     id: Line
-    #: Digest of the capture.
     digest: Line
     #: `right`, `left` or `both`.
     hands: str = field(metadata={"choices": ("right", "left", "both")})
     #: Names of the perturbations that it declares.
     perturbations: Annotated[list[Line], Meta(max_length=20)]
-    #: Digest of the split.
     split_digest: Line
     #: True where the scoring masks are exact coverage, False where they are estimates.
     exact_masks: bool
@@ -203,7 +191,6 @@ class MethodId:
 class Results:
     """One evaluation: a method on a set of captures."""
 
-    #: The method.
     method: MethodId
     #: Name of the suite, or `captures` when captures were named one by one.
     suite: Line
@@ -220,9 +207,7 @@ class Results:
     environment: FreeTable
     #: When the evaluation started, ISO 8601, UTC.
     started: Line
-    #: One entry a capture.
     captures: Annotated[list[CaptureResult], Meta(max_length=MAX_CAPTURES)]
-    #: Version of the toolkit.
     toolkit: Line
 
     def __post_init__(self) -> None:
@@ -322,19 +307,16 @@ def differing_settings(results: Sequence[Results]) -> list[str]:
     ]
     told = []
     for result, mine in zip(results, texts, strict=True):
+        title = result.method.title
         twins = [
             table
             for other, table in zip(results, texts, strict=True)
-            if other.method.title == result.method.title
+            if other.method.title == title
         ]
         names = sorted({name for table in twins for name in table})
-        told.append(
-            ", ".join(
-                f"{name} = {mine[name][:_SHOWN]}" if name in mine else f"{name} default"
-                for name in names
-                if len({table.get(name) for table in twins}) > 1
-            )
-        )
+        different = [name for name in names if len({table.get(name) for table in twins}) > 1]
+        values = {name: f"= {value[:_SHOWN]}" for name, value in mine.items()}
+        told.append(", ".join(f"{name} {values.get(name, 'default')}" for name in different))
     return told
 
 
@@ -382,9 +364,7 @@ def isolation_note(results: Sequence[Results]) -> str:
 def add_isolation_note(table: Table, results: Sequence[Results]) -> Table:
     """Return a table with `isolation_note` below it, once."""
     note = isolation_note(results)
-    if not note or note in table.notes:
-        return table
-    return replace(table, notes=(*table.notes, note))
+    return table if note in ("", *table.notes) else replace(table, notes=(*table.notes, note))
 
 
 # --- the environment of a result
@@ -398,17 +378,13 @@ def environment() -> dict[str, Any]:
     """
     versions = {}
     for package in PACKAGES:
-        try:
+        with contextlib.suppress(metadata.PackageNotFoundError):
             versions[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            continue
     return {
         "python": platform.python_version(),
         "system": f"{platform.system()} {platform.machine()}",
         "processor": _processor(),
-        "cores": len(os.sched_getaffinity(0))
-        if hasattr(os, "sched_getaffinity")
-        else os.cpu_count(),
+        "cores": len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count(),
         "packages": versions,
         "code": code_digest(),
         "caches": NEW_CACHES,
@@ -419,17 +395,13 @@ def code_digest() -> str:
     """Return the SHA-256 (hex) of the toolkit's own modules: names and contents."""
     root = packages.PACKAGES / "hwp_bench"
     # The shipped methods lie in `_data` in a wheel and elsewhere in a checkout.
-    shipped = root / "_data"
-    modules = (path for path in root.rglob("*.py") if not path.is_relative_to(shipped))
+    modules = (path for path in root.rglob("*.py") if not path.is_relative_to(root / "_data"))
     return files_digest(root, modules)
 
 
 def _processor() -> str:
-    try:
-        with open("/proc/cpuinfo", encoding="utf-8") as stream:
-            for line in stream:
-                if line.startswith("model name"):
-                    return line.split(":", 1)[1].strip()
-    except OSError:
-        pass
+    with contextlib.suppress(OSError), open("/proc/cpuinfo", encoding="utf-8") as stream:
+        for line in stream:
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
     return platform.processor() or "unknown"

@@ -48,12 +48,7 @@ def read_results(path: str | os.PathLike[str]) -> Results:
 
 
 def read_unchanged(path: str | os.PathLike[str]) -> Results:
-    """Read a result file that nobody has changed by hand, as `read_results`.
-
-    Raises:
-        BadInput, BadResult: as `read_results`, or the content is not of the digest that the file
-            states.
-    """
+    """Read a result file that nobody has changed by hand, as `read_results`."""
     results, content = _read(Path(path))
     stated, found = content_digest(content)
     if stated not in (None, found):
@@ -78,12 +73,7 @@ def _read(path: Path) -> tuple[Results, Mapping[str, Any]]:
 def result_files(path: str | os.PathLike[str]) -> list[Path]:
     """Return the result files that a path stands for.
 
-    Args:
-        path: a `results.json`, a results folder, an `ablation.json`, or an ablation's folder.
-
-    Raises:
-        BadInput: an `ablation.json` is damaged, or names a file outside its folder.
-        BadResult: it is of another version.
+    It is a `results.json`, a results folder, an `ablation.json`, or an ablation's folder.
     """
     place = Path(path)
     record = place / ABLATION if place.is_dir() else place
@@ -102,9 +92,6 @@ def results_among(paths: Iterable[str | os.PathLike[str]]) -> list[Path]:
 
     Folders and files that hold no results (figures, notes, other commands' folders) are left out
     and said, as long as another path holds some.
-
-    Raises:
-        BadInput, BadResult: as `result_files`.
     """
     places = list(paths)
     others = [path for path in places if _holds_none(Path(path))]
@@ -122,9 +109,5 @@ def _holds_none(place: Path) -> bool:
 
 
 def read_all(paths: Iterable[str | os.PathLike[str]]) -> list[Results]:
-    """Read every evaluation that some paths stand for, in order.
-
-    Raises:
-        BadInput, BadResult: one is missing or damaged, or was changed by hand.
-    """
+    """Read every evaluation that some paths stand for, in order; none was changed by hand."""
     return [read_unchanged(file) for file in results_among(paths)]

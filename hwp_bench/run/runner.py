@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import shutil
 import signal
 import sys
@@ -15,7 +16,7 @@ from pathlib import Path
 from hwp_bench.base.console import notice
 from hwp_bench.base.errors import BadInput, BadMethod, MethodFailed, one_line, shown
 from hwp_bench.base.files import inside, read_json, temporary_name, write_json
-from hwp_bench.base.folders import remove_tree, scratch_folder
+from hwp_bench.base.folders import open_up, remove_tree, scratch_folder
 from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.manifest import MethodManifest
 from hwp_bench.results.schema import ISOLATED
@@ -33,7 +34,6 @@ from hwp_bench.run.sandbox.supervise import (
     Limits,
     ProcessOutcome,
     Program,
-    remove_odd_files,
     run_confined,
 )
 from hwp_bench.run.worker import (
@@ -97,14 +97,14 @@ def run_method(
 ) -> RunRecord:
     """Run a method on a request."""
     if manifest.kind == "predictions":
-        folder = inside(manifest.root, f"{manifest.entry.predictions}/{capture_id}")
+        below = f"{manifest.entry.predictions}/{capture_id}"
+        folder, clip = inside(manifest.root, below), inside(manifest.root, f"{below}/{FREE_VIEW}")
         if not folder.is_dir():
             raise BadMethod(
                 f"has no predictions for {capture_id}",
                 where=folder,
-                remedy=f"Put the frames into {manifest.entry.predictions}/{capture_id}/.",
+                remedy=f"Put the frames into {below}/.",
             )
-        clip = inside(manifest.root, f"{manifest.entry.predictions}/{capture_id}/{FREE_VIEW}")
         return RunRecord(folder, RunFacts(), 0.0, free_view=clip if clip.is_dir() else None)
     confinement = confinement or Confinement()
     remove_tree(output)
@@ -116,48 +116,38 @@ def run_method(
     space = SpaceWatch(folders[1])
     outcome, isolation = _run(manifest, *folders, confinement, limits, on_progress, space=space)
     wall = time.perf_counter() - started
-    # First the links: a method may have put one in the place of these folders.
-    remove_odd_files(output)
+    # First the links, pipes, sockets and devices. A link that leads nowhere inside a sandbox leads
+    # to real files outside it: the toolkit would read a test frame for a prediction. A method may
+    # also have put one in the place of the folders below.
+    open_up(output)
     for name in (CACHE, HOME):
         remove_tree(output / name)
     shortage = space.finish(outcome.log_problem)
-    reason = f"; {shortage}" if shortage else ""
-    log = output / LOG
+    problem = remedy = field = None
+    facts = RunFacts()
     if outcome.stopped is not None:
-        broken = _broken(outcome.stopped, f"on {capture_id}", limits)
-        raise MethodFailed(
-            f"{manifest.name} {broken}{reason}",
-            where=log,
-            remedy=_REMEDIES[outcome.stopped],
-        )
-    if outcome.status != 0:
+        problem = _broken(outcome.stopped, f"on {capture_id}", limits)
+        remedy = _REMEDIES[outcome.stopped]
+    elif outcome.status != 0:
+        problem = f"failed on {capture_id}: {_reason(output, outcome.status)}"
         if outcome.starved:
-            reason = f"; the kernel ended processes for want of memory meanwhile{reason}"
-        raise MethodFailed(
-            f"{manifest.name} failed on {capture_id}: {_reason(output, outcome.status)}{reason}",
-            where=log,
-            remedy=_REMEDIES["machine"] if outcome.starved else None,
-        )
-    if manifest.kind == "python" and not (output / RUN).is_file():
-        raise MethodFailed(
-            f"{manifest.name} ended before it had rendered every frame of {capture_id}{reason}",
-            where=log,
-        )
-    try:
-        facts = read_facts(output / RUN)
-    except BadInput as error:
-        problem = f"{manifest.name} wrote a {RUN} that cannot be read ({error.problem}){reason}"
-        raise MethodFailed(problem, where=log, field=error.field) from error
+            problem += "; the kernel ended processes for want of memory meanwhile"
+            remedy = _REMEDIES["machine"]
+    elif manifest.kind == "python" and not (output / RUN).is_file():
+        problem = f"ended before it had rendered every frame of {capture_id}"
+    else:
+        try:
+            facts = read_facts(output / RUN)
+        except BadInput as error:
+            problem = f"wrote a {RUN} that cannot be read ({error.problem})"
+            field = error.field
+    if problem is not None:
+        reason = f"; {shortage}" if shortage else ""
+        text = f"{manifest.name} {problem}{reason}"
+        raise MethodFailed(text, where=output / LOG, field=field, remedy=remedy)
     clip = output / FREE_VIEW
-    offered = manifest.kind == "python" or clip.is_dir()
-    return RunRecord(
-        output / PREDICTIONS,
-        facts,
-        wall,
-        isolation,
-        clip if offered else None,
-        shortage,
-    )
+    free_view = clip if manifest.kind == "python" or clip.is_dir() else None
+    return RunRecord(output / PREDICTIONS, facts, wall, isolation, free_view, shortage)
 
 
 def rehearse_method(
@@ -216,10 +206,11 @@ def _run(
         if on_progress is not None:
             _show_progress(output / PROGRESS, on_progress)
 
+    isolation = "processes"
     if confinement.mode != "none":
         environment, places = sandbox_environment(manifest.root, request, output, confinement)
-        memory_files = has_accelerators()
-        walled = Program(command, output, environment, places, output / LOG, memory_files)
+        log, memory_files = output / LOG, has_accelerators()
+        walled = Program(command, output, environment, places, log, memory_files)
         outcome = run_confined(walled, limits, poll)
         if outcome.refused is None:
             return outcome, ISOLATED
@@ -231,8 +222,6 @@ def _run(
                 remedy="docs/threat-model.md says what they need.",
             )
         isolation = f"processes ({outcome.refused})"
-    else:
-        isolation = "processes"
     environment = plain_environment(manifest.root, output)
     plain = Program(command, output, environment, None, output / LOG)
     outcome = run_confined(plain, limits, poll)
@@ -242,22 +231,19 @@ def _run(
 
 
 def _command(manifest: MethodManifest, request: Path, output: Path) -> list[str]:
-    if manifest.kind == "python":
-        worker = [sys.executable, *START, "hwp_bench.run.worker"]
-        method = ["--method", str(manifest.root.resolve()), "--entry", str(manifest.entry.python)]
-        return [*worker, str(request.resolve()), str(output.resolve()), *method]
     places = {
-        "{request}": str(request.resolve()),
-        "{output}": str(output.resolve()),
-        "{method}": str(manifest.root.resolve()),
-        "{python}": sys.executable,
+        "request": str(request.resolve()),
+        "output": str(output.resolve()),
+        "method": str(manifest.root.resolve()),
+        "python": sys.executable,
     }
-    words = []
-    for word in manifest.entry.command or ():
-        for place, value in places.items():
-            word = word.replace(place, value)
-        words.append(word)
-    return words
+    if manifest.kind == "python":
+        worker = ["{python}", *START, "hwp_bench.run.worker", "{request}", "{output}"]
+        words = [*worker, "--method", "{method}", "--entry", str(manifest.entry.python)]
+    else:
+        words = list(manifest.entry.command or ())
+    pattern = "|".join(places)
+    return [re.sub(rf"{{({pattern})}}", lambda found: places[found[1]], word) for word in words]
 
 
 def _show_progress(path: Path, on_progress: Callable[[int, int], None]) -> None:
@@ -307,12 +293,10 @@ def _look_for_program(manifest: MethodManifest) -> None:
     program = word.replace("{method}", str(manifest.root.resolve()))
     if "{" in program or (os.sep in program and not os.path.isabs(program)):
         return
-    problem = ""
     if shutil.which(program) is None:
         problem = f"there is no program {word!r}"
         if os.path.isfile(program):
             problem = f"the program {word!r} is not executable"
-    if problem:
         raise BadMethod(
             problem,
             where=manifest.root,

@@ -25,7 +25,7 @@ from hwp_bench.base.arrays import evenly
 from hwp_bench.base.console import notice
 from hwp_bench.base.errors import BadMethod, HwpError, MethodFailed, shown
 from hwp_bench.base.files import read_json, write_json
-from hwp_bench.base.images import write_image
+from hwp_bench.base.images import as_uint8, write_image
 from hwp_bench.base.records import Count, Line, Seconds, parse_record
 from hwp_bench.capture.schema import frame_name
 from hwp_bench.hands.skeleton import Camera, HandPose
@@ -69,6 +69,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--rehearse", action="store_true")
     args = parser.parse_args(arguments)
     args.output.mkdir(parents=True, exist_ok=True)
+    status = 1
     try:
         factory = load_entry(args.method, args.entry)
         if args.rehearse:
@@ -76,28 +77,21 @@ def main(arguments: list[str] | None = None) -> int:
             factory(asked["settings"], asked["seed"])
         else:
             run(open_request(args.request), factory, args.output)
-    except HwpError as error:
-        print(f"error: {error}", file=sys.stderr)
-        _leave_reason(args.output, str(error))
-        return 1
-    except SystemExit as error:
-        if isinstance(error.code, int | None):
+        return 0
+    except (HwpError, SystemExit) as error:
+        if isinstance(error, SystemExit) and isinstance(error.code, int | None):
             raise
-        print(f"error: {error.code}", file=sys.stderr)
-        _leave_reason(args.output, str(error.code))
-        return 1
+        problem = str(error)
+        print(f"error: {problem}", file=sys.stderr)
     except BaseException as error:
         traceback.print_exc()
-        _leave_reason(args.output, f"{type(error).__name__}: {error}")
-        return 130 if isinstance(error, KeyboardInterrupt) else 1
-    return 0
-
-
-def _leave_reason(output: Path, problem: str) -> None:
-    """Leave the reason of a failure for the runner; a full disc takes it from nobody else."""
+        problem = f"{type(error).__name__}: {error}"
+        status = 130 if isinstance(error, KeyboardInterrupt) else 1
+    # For the runner; a full disc takes the reason from nobody else.
     with contextlib.suppress(HwpError, ValueError):
         # A message may hold what no file of Unicode can.
-        write_json(output / FAILURE, {"problem": shown(problem[:2000])})
+        write_json(args.output / FAILURE, {"problem": shown(problem[:2000])})
+    return status
 
 
 def load_entry(method: Path, entry: str) -> MethodFactory:
@@ -118,7 +112,8 @@ def load_entry(method: Path, entry: str) -> MethodFactory:
 
 def run(training: TrainingCapture, factory: MethodFactory, output: Path) -> None:
     """Fit, render the targets, and write predictions, checkpoints and `run.json`."""
-    frames = checkpoint_frames(training.validation)
+    validation = training.validation
+    frames = validation[evenly(len(validation), CHECKPOINT_FRAMES)].tolist()
 
     def record(index: int, avatar: Avatar) -> None:
         for frame in frames:
@@ -153,7 +148,7 @@ def run(training: TrainingCapture, factory: MethodFactory, output: Path) -> None
         curve_seconds=report.paused,
         steps=final_step,
         peak_memory=peak_memory(),
-        device=device_name(avatar),
+        device=str(getattr(avatar, "device", "cpu"))[:100],
         checkpoint_frames=frames,
         checkpoints=report.checkpoints,
     )
@@ -163,26 +158,21 @@ def run(training: TrainingCapture, factory: MethodFactory, output: Path) -> None
 def render_free_views(avatar: Avatar, training: TrainingCapture, folder: Path) -> None:
     """Render the free-view clip, if there is one; a frame that fails costs itself and no more."""
     views = training.free_views
-    for frame in range(0 if views is None else len(views)):
-        assert views is not None
+    if views is None:
+        return
+    for frame in range(len(views)):
+        hands = views.hand_poses(frame)
         camera = views.cameras.camera(frame, training.width, training.height)
         try:
-            pixels = render_checked(
-                avatar, views.hand_poses(frame), camera, f"free-view frame {frame}"
-            )
+            pixels = render_checked(avatar, hands, camera, f"free-view frame {frame}")
         except Exception:
             traceback.print_exc()
             continue
         write_image(folder / frame_name(frame), pixels)
 
 
-def checkpoint_frames(validation: np.ndarray) -> list[int]:
-    """Return at most eight validation frames, evenly spaced."""
-    return validation[evenly(len(validation), CHECKPOINT_FRAMES)].tolist()
-
-
 def render(avatar: Avatar, training: TrainingCapture, frame: int) -> np.ndarray:
-    """Render one frame of the capture; see `drawn`."""
+    """Render one frame of the capture; see `render_checked`."""
     hands, camera = training.hand_poses(frame), training.camera(frame)
     return render_checked(avatar, hands, camera, f"frame {frame}")
 
@@ -204,14 +194,7 @@ def render_checked(
         raise MethodFailed(f"render returned {image.dtype}, not real numbers", field=name)
     if not np.isfinite(image).all():
         raise MethodFailed("render returned NaN or infinity", field=name)
-    from hwp_bench.base.images import as_uint8
-
     return as_uint8(np.asarray(image[:, :, :3], dtype=np.float64))
-
-
-def device_name(avatar: Avatar) -> str:
-    """Return the device that the avatar names; `cpu` if it names none."""
-    return str(getattr(avatar, "device", "cpu"))[:100]
 
 
 # --- the clock and its checkpoints
@@ -228,7 +211,8 @@ class ReportClock:
         self._record = record
         self._progress_file = progress_file
         self._last_progress = 0.0
-        self._paused = 0.0
+        #: Seconds that the clock has stood still for checkpoints.
+        self.paused = 0.0
         self._start = time.perf_counter()
         self._paused_cpu = 0.0
         self._start_cpu = cpu_seconds()
@@ -237,17 +221,12 @@ class ReportClock:
     @property
     def elapsed(self) -> float:
         """Seconds on the method's clock."""
-        return time.perf_counter() - self._start - self._paused
+        return time.perf_counter() - self._start - self.paused
 
     @property
     def cpu_seconds(self) -> float:
         """CPU seconds of this process and of children that have ended, on the method's clock."""
         return cpu_seconds() - self._start_cpu - self._paused_cpu
-
-    @property
-    def paused(self) -> float:
-        """Seconds that the clock has stood still for checkpoints."""
-        return self._paused
 
     def __call__(self, step: int, avatar: Avatar) -> None:
         """Take a checkpoint if one is due; the first offer is always one."""
@@ -264,7 +243,7 @@ class ReportClock:
         self._due_steps = [due for due in self._due_steps if due > step]
         self._record(len(self.checkpoints), avatar)
         self.checkpoints.append(Checkpoint(step, seconds, peak_memory()))
-        self._paused += time.perf_counter() - entered
+        self.paused += time.perf_counter() - entered
         self._paused_cpu += cpu_seconds() - entered_cpu
 
     def progress(self, done: int, total: int) -> None:
@@ -275,7 +254,7 @@ class ReportClock:
             # A fit need not end because its bar stands still.
             with contextlib.suppress(HwpError):
                 write_json(self._progress_file, {"done": int(done), "total": int(total)})
-            self._paused += time.perf_counter() - now
+            self.paused += time.perf_counter() - now
 
 
 def checkpoint_times(budget: Budget) -> list[float]:
@@ -309,13 +288,10 @@ def peak_memory() -> int:
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """One recorded moment of a fit."""
+    """One recorded moment of a fit; see `results.CurvePoint`."""
 
-    #: Optimizer steps done.
     step: Count
-    #: Seconds on the method's clock.
     seconds: Seconds
-    #: Peak memory of the process until then, bytes.
     peak_memory: Count
 
 
@@ -337,7 +313,6 @@ class RunFacts:
     steps: Count | None = None
     #: Peak memory of the process, bytes.
     peak_memory: Count | None = None
-    #: Device that the method ran on.
     device: Line | None = None
     #: Validation frames that were rendered for every checkpoint.
     checkpoint_frames: Annotated[list[Count], Meta(max_length=MAX_FRAMES)] = field(

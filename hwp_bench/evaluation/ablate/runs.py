@@ -6,23 +6,23 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 from hwp_bench.analysis.pairing import MethodRuns
 from hwp_bench.base.errors import UsageError, did_you_mean
 from hwp_bench.capture.splits import Split
+from hwp_bench.commitments.publication import open_captures
 from hwp_bench.evaluation.evaluate import (
     EvaluationSettings,
+    How,
     OnCapture,
     make_plan,
-    open_captures,
     run_plans,
     with_setting_files,
 )
 from hwp_bench.methods.manifest import MANIFEST, MethodManifest, Switch
 from hwp_bench.metrics.lpips import load_available
 from hwp_bench.results import Results
-from hwp_bench.run.engine import Engine, Needs
 
 #: Components that are crossed when nothing is asked for and the method names none.
 DEFAULT_FACTORS = 2
@@ -70,7 +70,6 @@ class Design:
     alternatives: tuple[Switch, ...]
     #: Variants, the barest first, the full method last before the alternatives.
     variants: tuple[Variant, ...]
-    #: Effects.
     effects: tuple[AblationEffect, ...]
 
 
@@ -107,7 +106,10 @@ def make_design(
     if crossed and (alternatives or len(components) > MAX_FACTORS):
         raise UsageError(f"at most {MAX_FACTORS} components, no alternatives, can be crossed")
     factorial = bool(crossed) or len(components) <= DEFAULT_FACTORS
-    outs = _all_subsets(components) if factorial else _one_by_one(components)
+    outs = [(), *((item,) for item in components), components]
+    if factorial:
+        counts = range(len(components) + 1)
+        outs = [subset for count in counts for subset in combinations(components, count)]
     variants = [_variant(out) for out in sorted(outs, key=len, reverse=True)]
     effects = _factorial_effects(components) if factorial else _out_effects(components)
     if factorial and len(components) > DEFAULT_FACTORS:
@@ -130,15 +132,6 @@ def _switch(manifest: MethodManifest, name: str) -> Switch:
         field="switches",
         remedy=did_you_mean(name, manifest.switches) or f"It declares: {known}.",
     )
-
-
-def _all_subsets(components: Sequence[Switch]) -> list[tuple[Switch, ...]]:
-    counts = range(len(components) + 1)
-    return [subset for count in counts for subset in combinations(components, count)]
-
-
-def _one_by_one(components: Sequence[Switch]) -> list[tuple[Switch, ...]]:
-    return [(), *((item,) for item in components), tuple(components)]
 
 
 def _variant(thrown: tuple[Switch, ...]) -> Variant:
@@ -187,10 +180,14 @@ def _out_effects(components: Sequence[Switch]) -> list[AblationEffect]:
 class AblationRuns:
     """Every evaluation of an ablation."""
 
-    #: The variants that were run.
     design: Design
     #: The evaluations by variant, in the design's order.
     runs: Mapping[str, MethodRuns]
+
+    @property
+    def any_run(self) -> MethodRuns:
+        """One of the runs; all have the same captures and seeds."""
+        return next(iter(self.runs.values()))
 
     @property
     def results(self) -> list[Results]:
@@ -213,10 +210,7 @@ def run_ablation(
     *,
     splits: Mapping[str, Split] | None = None,
     on_job: OnCapture | None = None,
-    engine: Engine | None = None,
-    needs: Needs | None = None,
-    overwrite: bool = False,
-    rehearse: bool = False,
+    **how: Unpack[How],
 ) -> AblationRuns:
     """Run an ablation; what is on disk from an earlier start is taken as it is, and said.
 
@@ -229,47 +223,25 @@ def run_ablation(
     settings = with_setting_files(manifest, settings)
     opened = open_captures(captures, splits)
     networks = load_available()
-    plans = {
-        result_folder(variant.name, seed): make_plan(
-            replace(manifest, title=f"{manifest.title} {variant.title}".strip()),
-            opened,
-            _of_variant(settings, variant, seed),
-            networks,
-            f"{variant.name}, seed {seed}",
-        )
-        for variant in design.variants
-        for seed in seeds
-    }
-    order = [
-        (result_folder(variant.name, seed), number)
-        for seed in seeds
-        for number in range(len(opened))
-        for variant in _rotated(design.variants, number + seed)
-    ]
-    results = run_plans(
-        out,
-        plans,
-        order,
-        on_start=on_job,
-        engine=engine,
-        needs=needs,
-        overwrite=overwrite,
-        rehearse=rehearse,
-        tables=False,
-    )
+    plans, order = {}, []
+    for seed in seeds:
+        for variant in design.variants:
+            chosen = {**settings.run.settings, **variant.settings}
+            plans[result_folder(variant.name, seed)] = make_plan(
+                replace(manifest, title=f"{manifest.title} {variant.title}".strip()),
+                opened,
+                replace(settings, run=replace(settings.run, settings=chosen, seed=seed)),
+                networks,
+                f"{variant.name}, seed {seed}",
+            )
+        for number in range(len(opened)):
+            start = (number + seed) % len(design.variants)
+            turned = (*design.variants[start:], *design.variants[:start])
+            order += [(result_folder(variant.name, seed), number) for variant in turned]
+    results = run_plans(out, plans, order, on_start=on_job, tables=False, **how)
     runs = {}
     for variant in design.variants:
         by_seed = {seed: results[result_folder(variant.name, seed)] for seed in seeds}
         title = plans[result_folder(variant.name, seeds[0])].manifest.title
         runs[variant.name] = MethodRuns(title, by_seed)
     return AblationRuns(design, runs)
-
-
-def _of_variant(settings: EvaluationSettings, variant: Variant, seed: int) -> EvaluationSettings:
-    overrides = {**settings.run.settings, **variant.settings}
-    return replace(settings, run=replace(settings.run, settings=overrides, seed=seed))
-
-
-def _rotated(variants: Sequence[Variant], by: int) -> list[Variant]:
-    start = by % len(variants)
-    return [*variants[start:], *variants[:start]]

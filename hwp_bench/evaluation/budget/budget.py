@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
+from hwp_bench.analysis.columns import Filled, block_breaks, table_of
 from hwp_bench.base.drawing import PAPER, error_map, fitted, labelled, sheet
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.images import as_uint8
@@ -19,13 +20,12 @@ from hwp_bench.evaluation.budget.corrections import CORRECTIONS
 from hwp_bench.evaluation.budget.surface import NAME as CEILING
 from hwp_bench.evaluation.budget.surface import TEXT as CEILING_TEXT
 from hwp_bench.evaluation.budget.surface import Ceiling, Pair, error_of, pairs_of
-from hwp_bench.evaluation.evaluate import EvaluationSettings, OnCapture, evaluate
+from hwp_bench.evaluation.evaluate import EvaluationSettings, How, OnCapture, evaluate
 from hwp_bench.methods.contract import FRAME_CHOICES
 from hwp_bench.methods.request import ORACLE_INPUTS, frame_choice, known_oracle_inputs
 from hwp_bench.metrics.pixels import decibels
 from hwp_bench.metrics.protocol import PSNR_CAP
 from hwp_bench.results import CaptureResult, Results
-from hwp_bench.run.engine import Engine, Needs
 from hwp_bench.sim.produce.truth import add_subject_mesh
 
 #: Name of the evaluation in which nothing is replaced, and of that in which everything is.
@@ -42,11 +42,9 @@ _EDGE, _MARGIN = 176, 4
 class BudgetRuns:
     """The evaluations of an error budget."""
 
-    #: The captures, in order.
     captures: tuple[Capture, ...]
     #: Results by what the truth replaced: `GIVEN`, names in `ORACLE_INPUTS`, `ALL`.
     results: Mapping[str, Results]
-    #: Their folders by the same names.
     folders: Mapping[str, Path]
 
 
@@ -59,10 +57,7 @@ def run_budget(
     *,
     splits: Mapping[str, Split] | None = None,
     on_run: Callable[[int, int, str], OnCapture | None] | None = None,
-    engine: Engine | None = None,
-    needs: Needs | None = None,
-    overwrite: bool = False,
-    rehearse: bool = False,
+    **how: Unpack[How],
 ) -> BudgetRuns:
     """Evaluate a method as it is, with each truth in place of an estimate, and with all of them.
 
@@ -85,11 +80,10 @@ def run_budget(
             replace(settings, run=replace(settings.run, frames=frame_choice(replaced))),
             splits=splits,
             on_capture=on_run(index, len(variants), name) if on_run else None,
-            engine=engine,
-            needs=needs,
-            overwrite=overwrite,
-            rehearse=rehearse and index == 0,
+            **how,
         )
+        # The method is made once, before the first capture of the first run.
+        how["rehearse"] = False
     return BudgetRuns(opened, results, folders)
 
 
@@ -113,9 +107,7 @@ def plan_variants(
 ) -> dict[str, tuple[str, ...]]:
     """The estimates that the truth replaces in each evaluation, by its name."""
     common = [
-        name
-        for name in ORACLE_INPUTS
-        if name in truths and all(name in capture for capture in known)
+        name for name in ORACLE_INPUTS if name in truths and all(name in one for one in known)
     ]
     variants: dict[str, tuple[str, ...]] = {GIVEN: ()}
     variants |= {name: (name,) for name in common}
@@ -134,7 +126,6 @@ class BudgetRow:
     #: `truth` (before fitting), `correction` (of the rendered test frames) or `ceiling` (an avatar
     #: without an error of its own).
     kind: str
-    #: Its name.
     name: str
     #: What that means, for people.
     text: str
@@ -153,7 +144,6 @@ class BudgetRow:
 class ErrorBudget:
     """An error budget."""
 
-    #: Title of the method.
     method: str
     #: PSNR of the method as it is by capture, dB.
     psnr: Mapping[str, float]
@@ -172,15 +162,11 @@ def make_budget(runs: BudgetRuns) -> ErrorBudget:
 
     Frames that the method left out keep the protocol's penalty in every row.
     """
-    given = runs.results[GIVEN]
-    base = {capture.id: _psnr(capture) for capture in given.captures}
-    rows = []
-    for name, result in runs.results.items():
-        if name != GIVEN:
-            psnr = {capture.id: _psnr(capture) for capture in result.captures}
-            rows.append(
-                _row("truth", name, ORACLE_INPUTS.get(name, "all truths above"), psnr, base)
-            )
+    psnr = {
+        variant: {capture.id: _psnr(capture) for capture in result.captures}
+        for variant, result in runs.results.items()
+    }
+    base, given = psnr.pop(GIVEN), runs.results[GIVEN]
     corrected: dict[str, dict[str, float]] = {name: {} for name in CORRECTIONS}
     shown, ceilings = {}, {}
     for capture, found in zip(runs.captures, given.captures, strict=True):
@@ -200,12 +186,16 @@ def make_budget(runs: BudgetRuns) -> ErrorBudget:
             ceilings[found.id] = float(np.mean(most))
         order = sorted(scores, key=lambda frame: (scores[frame], frame))
         shown[found.id] = order[len(order) // 2]
-    rows += [
-        _row("correction", name, text, corrected[name], base)
-        for name, (_, text) in CORRECTIONS.items()
+    parts = [
+        ("truth", name, ORACLE_INPUTS.get(name, "all truths above"), psnr[name]) for name in psnr
     ]
+    parts += [("correction", n, text, corrected[n]) for n, (_, text) in CORRECTIONS.items()]
     if len(ceilings) == len(base):
-        rows.append(_row("ceiling", CEILING, CEILING_TEXT, ceilings, base))
+        parts.append(("ceiling", CEILING, CEILING_TEXT, ceilings))
+    rows = [
+        BudgetRow(kind, name, text, table, {key: table[key] - base[key] for key in table})
+        for kind, name, text, table in parts
+    ]
     return ErrorBudget(given.method.title, base, tuple(rows), shown)
 
 
@@ -230,57 +220,42 @@ def next_work(budget: ErrorBudget) -> str:
 
 def budget_tables(budget: ErrorBudget) -> dict[str, Table]:
     """The tables `budget` (means over captures) and `captures` (gain on each)."""
-    count = len(budget.psnr)
-    columns = [
-        Column("Replaced or corrected"),
-        Column("By"),
-        Column("PSNR [dB]", 2),
-        Column("Gain [dB]", 2),
-        *([Column("Least", 2), Column("Most", 2)] if count > 1 else []),
+    count, rows = len(budget.psnr), budget.rows
+    gains = [list(row.gain.values()) for row in rows]
+    base = float(np.mean(list(budget.psnr.values())))
+    columns: list[Filled] = [
+        (Column("Replaced or corrected"), [GIVEN, *(row.name for row in rows)]),
+        (Column("By"), ["", *(row.text for row in rows)]),
+        (Column("PSNR [dB]", 2), [base, *(float(np.mean([*row.psnr.values()])) for row in rows)]),
+        (Column("Gain [dB]", 2), [None, *(row.mean_gain for row in rows)]),
     ]
-    means = [float(np.mean(list(budget.psnr.values())))]
-    rows: list[tuple[Any, ...]] = [
-        (GIVEN, "", means[0], None, *((None, None) if count > 1 else ()))
-    ]
-    breaks = []
-    for index, row in enumerate(budget.rows):
-        if index == 0 or budget.rows[index - 1].kind != row.kind:
-            breaks.append(len(rows))
-        gains = list(row.gain.values())
-        spread = (min(gains), max(gains)) if count > 1 else ()
-        psnr = float(np.mean(list(row.psnr.values())))
-        rows.append((row.name, row.text, psnr, row.mean_gain, *spread))
-    notes = (
+    if count > 1:
+        columns += [
+            (Column("Least", 2), [None, *map(min, gains)]),
+            (Column("Most", 2), [None, *map(max, gains)]),
+        ]
+    notes = [
         "Truths replace what the method is given before it fits; corrections are fitted to each "
         "rendered test frame and bound what that kind of error costs. Rows do not add up.",
-        *(
-            [f"{CEILING.capitalize()}: what is left then are errors of the given test poses alone."]
-            if any(row.kind == "ceiling" for row in budget.rows)
-            else []
-        ),
         f"Means over {count} capture{'' if count == 1 else 's'}; least and most: of one capture.",
-    )
-    names = [row.name for row in budget.rows]
-    captures: list[tuple[Any, ...]] = [
-        (capture, value, *(row.gain[capture] for row in budget.rows))
-        for capture, value in budget.psnr.items()
     ]
-    by_capture = (
-        Column("Capture"),
-        Column("PSNR [dB]", 2),
-        *(Column(name, 2, group="Gain [dB]") for name in names),
-    )
+    if any(row.kind == "ceiling" for row in rows):
+        text = "what is left then are errors of the given test poses alone."
+        notes.insert(1, f"{CEILING.capitalize()}: {text}")
     title = f"Error budget of {budget.method}"
+    breaks = block_breaks(["given", *(row.kind for row in rows)])
+    by_capture: list[Filled] = [
+        (Column("Capture"), list(budget.psnr)),
+        (Column("PSNR [dB]", 2), list(budget.psnr.values())),
+        *(
+            (Column(row.name, 2, group="Gain [dB]"), [row.gain[name] for name in budget.psnr])
+            for row in rows
+        ),
+    ]
     return {
-        "budget": Table(title, tuple(columns), tuple(rows), notes, False, tuple(breaks)),
-        "captures": Table(f"{title}, by capture", by_capture, tuple(captures), ranked=False),
+        "budget": table_of(title, columns, notes, ranked=False, breaks=breaks),
+        "captures": table_of(f"{title}, by capture", by_capture, ranked=False),
     }
-
-
-def _row(
-    kind: str, name: str, text: str, psnr: Mapping[str, float], base: Mapping[str, float]
-) -> BudgetRow:
-    return BudgetRow(kind, name, text, psnr, {key: psnr[key] - base[key] for key in psnr})
 
 
 def _psnr(capture: CaptureResult) -> float:

@@ -111,12 +111,8 @@ def motion(pair: Pair) -> np.ndarray:
 
     def moved(ways: np.ndarray) -> np.ndarray:
         dx, dy = np.einsum("hwk,ck->chw", shapes, ways)
-        return cv2.remap(
-            source,
-            (columns + dx).astype(np.float32),
-            (rows + dy).astype(np.float32),
-            cv2.INTER_LINEAR,
-        ).astype(np.float64)
+        across, down = (way.astype(np.float32) for way in (columns + dx, rows + dy))
+        return cv2.remap(source, across, down, cv2.INTER_LINEAR).astype(np.float64)
 
     def derivative(image: np.ndarray) -> np.ndarray:
         across, down = np.gradient(image, axis=1), np.gradient(image, axis=0)
@@ -204,10 +200,8 @@ def least_squares(derivatives: np.ndarray, rest: np.ndarray) -> np.ndarray:
     flat = derivatives.reshape(-1, derivatives.shape[-1])
     normal = flat.T @ flat
     ridge = _RIDGE * max(float(np.trace(normal)) / len(normal), 1e-12)
-    solution: np.ndarray = np.linalg.solve(
-        normal + ridge * np.eye(len(normal)), flat.T @ rest.reshape(-1)
-    )
-    return solution
+    found: np.ndarray = np.linalg.solve(normal + ridge * np.eye(len(normal)), flat.T @ rest.ravel())
+    return found
 
 
 #: The corrections by name, with what each of them takes away.

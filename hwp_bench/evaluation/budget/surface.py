@@ -90,15 +90,11 @@ def pairs_of(
             side: hand.at(frame, side) for side, hand in capture.hands.items() if hand.valid[frame]
         }
         camera = capture.cameras.camera(frame, capture.info.width, capture.info.height)
+        surface = MovingSurface(templates, shown, camera) if shown else None
+        region = scored_pixels(mask, erosion=HWP_V1.mask_erosion, coverage=exact)
         yield (
             frame,
-            Pair(
-                prediction=found.pixels / 255.0,
-                target=capture.frame(frame) / 255.0,
-                region=scored_pixels(mask, erosion=HWP_V1.mask_erosion, coverage=exact),
-                normals=normals,
-                surface=MovingSurface(templates, shown, camera) if shown else None,
-            ),
+            Pair(found.pixels / 255.0, capture.frame(frame) / 255.0, region, normals, surface),
         )
 
 
@@ -120,12 +116,11 @@ class MovingSurface:
         self._tensors = [templates[side].to_torch(torch.float64) for side in hands]
         starts = np.cumsum([0, *(len(templates[side].vertices) for side in hands)])
         self._parts = [slice(*ends) for ends in pairwise(starts.tolist())]
-        self._faces = np.concatenate(
-            [
-                templates[side].faces + part.start
-                for side, part in zip(hands, self._parts, strict=True)
-            ]
-        ).astype(np.int64)
+        faces = [
+            templates[side].faces + part.start
+            for side, part in zip(hands, self._parts, strict=True)
+        ]
+        self._faces = np.concatenate(faces).astype(np.int64)
         #: (K,) scale of an error in each number: 0.1 rad, 0.01 m.
         self.scales = np.tile(np.repeat([_TURN, _SHIFT], [_TURNS, 3]), len(hands))
         self._places, _ = self._project(np.zeros(len(self.scales)))
@@ -256,7 +251,6 @@ def at_given_poses(
 class Ceiling:
     """The score of an avatar without an error of its own, on a capture that knows the truth."""
 
-    #: The capture.
     capture: Capture
     #: Rest hands of its subject, by side.
     templates: Mapping[str, HandTemplate]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, Self
 
 from hwp_bench.base.errors import HwpError
 
@@ -15,8 +15,6 @@ OnProgress = Callable[[int, int], None]
 OnStart = Callable[[int, int, str], OnProgress | None]
 #: Called with the index of a job whose result is in its folder.
 OnDone = Callable[[int], None]
-#: Times that a job is started again after its worker was lost.
-RETRIES = 3
 
 
 @dataclass(frozen=True)
@@ -67,31 +65,27 @@ class Job:
     needs: Needs = field(default_factory=Needs)
 
 
-class Engine(Protocol):
+class Engine:
     """Runs jobs. A context manager; jobs run only inside its block."""
 
     #: Whether jobs run one after another in this process, and tell `on_start` of it.
-    in_turn: bool
+    in_turn = False
 
-    def __enter__(self) -> Engine: ...
-
-    def __exit__(self, *_: object) -> None: ...
-
-    def run(self, jobs: Sequence[Job], on_done: OnDone, on_start: OnStart | None = None) -> None:
-        """Run jobs; each result is in its folder before `on_done` hears of it."""
-        ...
-
-
-class LocalEngine:
-    """Runs jobs one after another in this process; each has the whole machine."""
-
-    in_turn = True
-
-    def __enter__(self) -> LocalEngine:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         pass
+
+    def run(self, jobs: Sequence[Job], on_done: OnDone, on_start: OnStart | None = None) -> None:
+        """Run jobs; each result is in its folder before `on_done` hears of it."""
+        raise NotImplementedError
+
+
+class LocalEngine(Engine):
+    """Runs jobs one after another in this process; each has the whole machine."""
+
+    in_turn = True
 
     def run(self, jobs: Sequence[Job], on_done: OnDone, on_start: OnStart | None = None) -> None:
         """Run jobs; see `Engine.run`."""
@@ -105,34 +99,12 @@ def ignore_progress(done: int, total: int) -> None:
     """Be told the steps of a job that nobody watches."""
 
 
-class Failures:
-    """Collects the errors of jobs, so that all are tried before the first is raised."""
-
-    def __init__(self) -> None:
-        self._errors: list[HwpError] = []
-
-    def add(self, error: HwpError) -> None:
-        """Note an error."""
-        self._errors.append(error)
-
-    def raise_first(self, count: int) -> None:
-        """Raise the first error, if any, saying how many of `count` jobs failed."""
-        if not self._errors:
-            return
-        first = self._errors[0]
-        if len(self._errors) == 1:
-            raise first
-        raise type(first)(
-            f"{first.problem} (the first of {len(self._errors)} failures in {count} jobs)",
-            where=first.where,
-            field=first.field,
-            remedy=first.remedy,
-        ) from first
-
-
-def worker_lost_error(text: str, retries: int, reason: str) -> HwpError:
-    """Return the error of a job that lost its worker too often."""
-    return HwpError(
-        f"the worker of the job {text!r} was lost {retries + 1} times ({reason})",
-        remedy="Is there enough memory? Start again with the same arguments: finished jobs stay.",
-    )
+def raise_first(errors: Sequence[HwpError], count: int) -> None:
+    """Raise the first error, if any, saying how many of `count` jobs failed."""
+    if len(errors) == 1:
+        raise errors[0]
+    if errors:
+        first = errors[0]
+        problem = f"{first.problem} (the first of {len(errors)} failures in {count} jobs)"
+        error = type(first)(problem, where=first.where, field=first.field, remedy=first.remedy)
+        raise error from first

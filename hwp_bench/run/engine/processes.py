@@ -19,7 +19,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,107 +30,87 @@ from hwp_bench.base.files import read_json, write_json
 from hwp_bench.base.packages import PACKAGES
 from hwp_bench.run import START
 from hwp_bench.run.engine.job import (
-    RETRIES,
-    Failures,
+    Engine,
     Job,
     Needs,
     OnDone,
     OnProgress,
     OnStart,
     Work,
-    worker_lost_error,
+    raise_first,
 )
 
+#: Times that a job is started again after its worker was lost.
+RETRIES = 3
 #: Variables that say how many threads a library starts.
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 #: Variable that says which GPUs a process sees.
 VISIBLE_GPUS = "CUDA_VISIBLE_DEVICES"
-#: How far the job is, in the folder of the process's messages.
-PROGRESS = "progress.json"
-#: Why the job failed, in the same folder.
-FAILURE = "failure.json"
-#: Exit status of a job that was told to stop.
-INTERRUPTED = 130
+# In the folder of the process's messages: how far the job is, why it failed, what it printed.
+_PROGRESS, _FAILURE, _LOG = "progress.json", "failure.json", "log.txt"
+# Exit status of a job that was told to stop.
+_INTERRUPTED = 130
 #: Seconds between two checks that the parent lives, and between two notes of progress.
 LOOK_SECONDS = 0.5
 #: Seconds that an orphan may take to end its own processes.
 GRACE_SECONDS = 20.0
 _POLL_SECONDS = 0.1
-#: The module that is started, and the one whose `main` it runs.
-_START = (*START, "hwp_bench.run.engine.processes")
 
 
-class ParallelEngine:
+class ParallelEngine(Engine):
     """Runs up to `at_once` jobs at once; a job whose process is killed is started again."""
 
-    in_turn = False
-
-    def __init__(
-        self, at_once: int, view: JobsView | None = None, *, retries: int = RETRIES
-    ) -> None:
+    def __init__(self, at_once: int, view: JobsView | None = None) -> None:
         self._at_once = at_once
         self._view = view or JobsView(quiet=True)
-        self._retries = retries
-
-    def __enter__(self) -> ParallelEngine:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
 
     def run(self, jobs: Sequence[Job], on_done: OnDone, on_start: OnStart | None = None) -> None:
         """Run jobs; see `Engine.run`."""
         # Before anything runs: whoever asks for too many GPUs is told at once.
-        visible = visible_gpus()
         needs = max((job.needs for job in jobs), key=lambda item: item.gpus, default=Needs())
         places: queue.SimpleQueue[tuple[int, dict[str, str]]] = queue.SimpleQueue()
-        for place in enumerate(divide_gpus(self._at_once, needs, visible), start=1):
+        for place in enumerate(divide_gpus(self._at_once, needs, visible_gpus()), start=1):
             places.put(place)
-        ended: queue.SimpleQueue[tuple[int, BaseException | None]] = queue.SimpleQueue()
         stop = threading.Event()
-        failures = Failures()
+        failures: list[HwpError] = []
 
         def run_one(index: int) -> None:
-            place, environment = places.get()
+            place, gpus = places.get()
             try:
-                if not stop.is_set():
-                    self._run(index, jobs[index], place, environment, stop)
-                ended.put((index, None))
-            except BaseException as error:
-                ended.put((index, error))
+                if not stop.is_set() and not jobs[index].finished():
+                    self._run(index, jobs[index], place, gpus, stop)
             finally:
-                places.put((place, environment))
+                places.put((place, gpus))
 
         with self._view as view, ThreadPoolExecutor(self._at_once) as pool:
+            view.begin(len(jobs))
+            waiting = {pool.submit(run_one, index): index for index in range(len(jobs))}
             try:
-                view.begin(len(jobs))
-                for index in range(len(jobs)):
-                    pool.submit(run_one, index)
-                for _ in jobs:
-                    index, error = _next(ended)
-                    if error is not None and not isinstance(error, HwpError):
-                        raise error
-                    view.end(index, jobs[index].text, None if error is None else str(error))
-                    if error is None:
-                        on_done(index)
-                    else:
-                        failures.add(error)
+                while waiting:
+                    # A wait without end would not let Ctrl-C through on every system.
+                    for future in wait(waiting, 1.0, FIRST_COMPLETED).done:
+                        index, error = waiting.pop(future), future.exception()
+                        if error is not None and not isinstance(error, HwpError):
+                            raise error
+                        view.end(index, jobs[index].text, None if error is None else str(error))
+                        if error is None:
+                            on_done(index)
+                        else:
+                            failures.append(error)
             finally:
                 stop.set()
-        failures.raise_first(len(jobs))
+        raise_first(failures, len(jobs))
 
     def _run(
         self, index: int, job: Job, place: int, gpus: dict[str, str], stop: threading.Event
     ) -> None:
-        if job.finished():
-            return
         local = LocalJob(
             job.work,
             {name: folder.path.absolute() for name, folder in job.inputs.items()},
             job.output.absolute(),
             {**thread_environment(job.needs), **gpus},
         )
-        for attempt in range(self._retries + 1):
+        for attempt in range(RETRIES + 1):
             self._view.start(index, job.text, f"place {place}")
             try:
                 run_in_process(
@@ -138,19 +118,16 @@ class ParallelEngine:
                 )
                 return
             except WorkerLost as error:
-                if attempt == self._retries:
-                    raise worker_lost_error(job.text, self._retries, str(error)) from error
+                if attempt == RETRIES:
+                    raise lost_error(job.text, str(error)) from error
 
 
-def _next(
-    ended: queue.SimpleQueue[tuple[int, BaseException | None]],
-) -> tuple[int, BaseException | None]:
-    # A wait without end would not let Ctrl-C through on every system.
-    while True:
-        try:
-            return ended.get(timeout=1.0)
-        except queue.Empty:
-            continue
+def lost_error(text: str, reason: str) -> HwpError:
+    """Return the error of a job that lost its worker too often."""
+    return HwpError(
+        f"the worker of the job {text!r} was lost {RETRIES + 1} times ({reason})",
+        remedy="Is there enough memory? Start again with the same arguments: finished jobs stay.",
+    )
 
 
 def visible_gpus() -> list[str]:
@@ -195,11 +172,9 @@ class Stopped(Exception):
 class LocalJob:
     """A job on the machine where it runs."""
 
-    #: The work.
+    #: The work, where its inputs lie, and the folder of its result.
     work: Work
-    #: Where its inputs lie here.
     inputs: Mapping[str, Path]
-    #: Folder of the result.
     output: Path
     #: Environment variables that it gets in addition to this process's.
     environment: Mapping[str, str]
@@ -220,13 +195,15 @@ def run_in_process(job: LocalJob, on_progress: OnProgress, stop: Callable[[], bo
     """Run a job in a process and wait for it."""
     with tempfile.TemporaryDirectory(prefix="hwp-job-") as name:
         messages = Path(name)
-        with open(messages / "log.txt", "wb") as log:
+        with open(messages / _LOG, "wb") as log:
             process = _start(job, messages, log.fileno())
         try:
             while process.poll() is None:
                 if stop():
                     raise Stopped
-                _show(messages / PROGRESS, on_progress)
+                if (messages / _PROGRESS).is_file():
+                    with contextlib.suppress(BadInput):
+                        on_progress(*read_json(messages / _PROGRESS))
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     process.wait(_POLL_SECONDS)
         finally:
@@ -235,51 +212,28 @@ def run_in_process(job: LocalJob, on_progress: OnProgress, stop: Callable[[], bo
 
 
 def _start(job: LocalJob, messages: Path, log: int) -> subprocess.Popen[bytes]:
-    root = os.fspath(PACKAGES)
-    known = os.environ.get("PYTHONPATH")
-    environment = {
-        **os.environ,
-        **job.environment,
-        "PYTHONPATH": root if not known else os.pathsep.join([root, known]),
-    }
+    path = [os.fspath(PACKAGES), *filter(None, [os.environ.get("PYTHONPATH")])]
     process = subprocess.Popen(
-        [sys.executable, *_START],
+        [sys.executable, *START, "hwp_bench.run.engine.processes"],
         stdin=subprocess.PIPE,
         stdout=log,
         stderr=log,
-        env=environment,
+        env={**os.environ, **job.environment, "PYTHONPATH": os.pathsep.join(path)},
         # Ctrl-C must reach it once, from us.
         start_new_session=True,
     )
     assert process.stdin is not None
-    content = (
-        job.work,
-        dict(job.inputs),
-        job.output,
-        messages,
-        os.getpid(),
-        [messages, *job.scratch],
-    )
     with contextlib.suppress(BrokenPipeError), process.stdin as stream:
-        stream.write(pickle.dumps(content))
+        stream.write(pickle.dumps((job, messages, os.getpid())))
     return process
-
-
-def _show(path: Path, on_progress: OnProgress) -> None:
-    if not path.is_file():
-        return
-    with contextlib.suppress(BadInput, TypeError, ValueError):
-        done, total = read_json(path, max_bytes=1000)
-        on_progress(int(done), int(total))
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
     """Stop a process that still runs, kindly first, so that it stops what it started."""
     if process.poll() is None:
         process.terminate()
-        deadline = time.monotonic() + GRACE_SECONDS
-        while process.poll() is None and time.monotonic() < deadline:
-            time.sleep(_POLL_SECONDS)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(GRACE_SECONDS)
     with contextlib.suppress(ProcessLookupError, PermissionError):
         os.killpg(process.pid, signal.SIGKILL)
     process.wait()
@@ -288,15 +242,14 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 def _raise_failure(status: int, messages: Path) -> None:
     if status == 0:
         return
-    failure = messages / FAILURE
-    if failure.is_file():
-        raise parse_error(read_json(failure))
+    if (messages / _FAILURE).is_file():
+        raise parse_error(read_json(messages / _FAILURE))
     if status < 0:
         raise WorkerLost(signal.Signals(-status).name)
-    if status == INTERRUPTED:
+    if status == _INTERRUPTED:
         # By somebody else: a stop that was asked for here raises `Stopped` before this line.
         raise WorkerLost("interrupted")
-    lines = (messages / "log.txt").read_text(errors="replace").strip().splitlines()
+    lines = (messages / _LOG).read_text(errors="replace").strip().splitlines()
     raise HwpError(f"a job broke: {lines[-1][:500] if lines else f'exit status {status}'}")
 
 
@@ -307,36 +260,32 @@ def main() -> int:
     """Read one job from standard input and do it; returns the exit status."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     # The job comes from our own parent process through a pipe.
-    work, inputs, output, messages, parent, folders = pickle.load(sys.stdin.buffer)
+    job, messages, parent = pickle.load(sys.stdin.buffer)
+    folders = [messages, *job.scratch]
     threading.Thread(target=_watch, args=(parent, folders), daemon=True).start()
+    due = 0.0
+
+    def note(done: int, total: int) -> None:
+        """Write down how far the job is, not too often; an orphan is stopped at its next step."""
+        nonlocal due
+        if os.getppid() != parent:
+            raise KeyboardInterrupt
+        if (now := time.monotonic()) >= due:
+            due = now + LOOK_SECONDS
+            with contextlib.suppress(HwpError):
+                write_json(messages / _PROGRESS, [int(done), int(total)])
+
     try:
-        work(inputs, output, _Note(messages / PROGRESS, parent))
+        job.work(job.inputs, job.output, note)
     except HwpError as error:
-        write_json(messages / FAILURE, error_record(error))
+        write_json(messages / _FAILURE, error_record(error))
         return 1
     except KeyboardInterrupt:
-        return INTERRUPTED
+        return _INTERRUPTED
     finally:
         if os.getppid() != parent:
             _remove(folders)
     return 0
-
-
-class _Note:
-    """Writes down how far the job is, not too often; an orphan is stopped at its next step."""
-
-    def __init__(self, path: Path, parent: int) -> None:
-        self._path = path
-        self._parent = parent
-        self._next = 0.0
-
-    def __call__(self, done: int, total: int) -> None:
-        if os.getppid() != self._parent:
-            raise KeyboardInterrupt
-        if (now := time.monotonic()) >= self._next:
-            self._next = now + LOOK_SECONDS
-            with contextlib.suppress(HwpError):
-                write_json(self._path, [done, total])
 
 
 def _watch(parent: int, folders: Sequence[Path]) -> None:
@@ -359,23 +308,12 @@ def _remove(folders: Sequence[Path]) -> None:
 
 def error_record(error: HwpError) -> dict[str, str | None]:
     """Return an error as JSON, on its way to another process or node; `parse_error` reads it."""
-    return {
-        "kind": type(error).__name__,
-        "problem": error.problem,
-        "where": error.where,
-        "field": error.field,
-        "remedy": error.remedy,
-    }
+    parts = {name: getattr(error, name) for name in ("problem", "where", "field", "remedy")}
+    return {"kind": type(error).__name__, **parts}
 
 
 def parse_error(value: Mapping[str, str | None]) -> HwpError:
     """Return the error of an `error_record`."""
-    kind = getattr(errors, str(value["kind"]), HwpError)
-    if not (isinstance(kind, type) and issubclass(kind, HwpError)):
-        kind = HwpError
-    return kind(
-        str(value["problem"]),
-        where=value["where"],
-        field=value["field"],
-        remedy=value["remedy"],
-    )
+    kind: type[HwpError] = getattr(errors, str(value["kind"]), HwpError)
+    parts = {name: value[name] for name in ("where", "field", "remedy")}
+    return kind(str(value["problem"]), **parts)

@@ -15,12 +15,11 @@ import sys
 import tempfile
 import threading
 import zipfile
-from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, cast
 
 from hwp_bench.base.console import JobsView
 from hwp_bench.base.errors import BadInput, HwpError, MissingDependency, UsageError
@@ -28,72 +27,56 @@ from hwp_bench.base.files import cache_root, files_digest, inside, temporary_nam
 from hwp_bench.base.numerics import flushed
 from hwp_bench.base.packages import PACKAGES
 from hwp_bench.run.engine.job import (
-    RETRIES,
-    Failures,
+    Engine,
     Folder,
     Job,
-    Needs,
     OnDone,
     OnStart,
     Work,
-    worker_lost_error,
+    raise_first,
 )
 from hwp_bench.run.engine.processes import (
+    LOOK_SECONDS,
+    RETRIES,
     VISIBLE_GPUS,
     LocalJob,
     WorkerLost,
     error_record,
+    lost_error,
     parse_error,
     run_in_process,
     thread_environment,
 )
 
-#: Largest folder that is sent, in bytes of content.
-MAX_BYTES = 8 << 30
-#: Most files and folders in it.
-MAX_ENTRIES = 1_000_000
+#: Largest folder that is sent, in bytes of content, and most files and folders in it.
+MAX_BYTES, MAX_ENTRIES = 8 << 30, 1_000_000
 #: Names that are never sent, at any depth: what Python and git make again.
 LEFT_OUT = frozenset({"__pycache__", ".git"})
 _EPOCH = (1980, 1, 1, 0, 0, 0)
-_CHUNK = 1 << 20
-#: Seconds that the head may take to accept a connection.
-CONNECT_SECONDS = 10.0
-#: Seconds that it may take to answer as a Ray head of this version.
-ANSWER_SECONDS = 60.0
+#: Seconds that the head may take to accept a connection, and to answer as a Ray head.
+CONNECT_SECONDS, ANSWER_SECONDS = 10.0, 60.0
 #: Port of a Ray head, where none is given.
 HEAD_PORT = 6379
 _REMEDY = "Give the address that `ray start --head` printed; run the command on a node of it."
+_QUIET = {"log_to_driver": False, "logging_level": "error"}
 # Ray itself tries for minutes before it gives up; so it is tried in a process that can be ended.
-_PROBE = (
-    "import sys, ray\nray.init(address=sys.argv[1], log_to_driver=False, logging_level='error')\n"
-)
-#: Packages and folders whose source decides what a job does.
-SOURCES = ("hwp_bench", "wildghand", "baselines")
-#: Endings of that source: programs, settings, and the free hand.
-SUFFIXES = {".py", ".toml", ".npz"}
-#: Seconds between two checks of the jobs.
-LOOK_SECONDS = 0.5
+_PROBE = f"import sys, ray\nray.init(address=sys.argv[1], **{_QUIET!r})\n"
+#: Packages and folders whose source decides what a job does, and its endings: programs, settings,
+#: and the free hand.
+SOURCES, SUFFIXES = ("hwp_bench", "wildghand", "baselines"), {".py", ".toml", ".npz"}
 #: Seconds that jobs may take to stop when their results are no longer needed.
 STOP_SECONDS = 20.0
 
 
-class RayEngine:
-    """Runs jobs on a Ray cluster."""
-
-    in_turn = False
+class RayEngine(Engine):
+    """Runs jobs on a Ray cluster; `shared` lets nodes look at the folders of this machine."""
 
     def __init__(
-        self,
-        address: str | None = None,
-        view: JobsView | None = None,
-        *,
-        shared: bool = True,
-        retries: int = RETRIES,
+        self, address: str | None = None, view: JobsView | None = None, *, shared: bool = True
     ) -> None:
         self._address = head_address(address)
         self._view = view or JobsView(quiet=True)
         self._shared = shared
-        self._retries = retries
         self._stack = contextlib.ExitStack()
         self._ray: Any = None
 
@@ -102,46 +85,40 @@ class RayEngine:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._ray = None
         self._stack.close()
 
     def run(self, jobs: Sequence[Job], on_done: OnDone, on_start: OnStart | None = None) -> None:
         """Run jobs; see `Engine.run`."""
         with self._view as view:
             view.begin(len(jobs))
-            _Run(self._ray, view, jobs, on_done, self._shared, self._retries).all()
+            _Run(self._ray, view, jobs, on_done, self._shared).all()
 
 
 class _Run:
     """One call of `RayEngine.run`."""
 
     def __init__(
-        self,
-        ray: Any,
-        view: JobsView,
-        jobs: Sequence[Job],
-        on_done: OnDone,
-        shared: bool,
-        retries: int,
+        self, ray: Any, view: JobsView, jobs: Sequence[Job], on_done: OnDone, shared: bool
     ) -> None:
-        self._ray = ray
-        self._view = view
-        self._jobs = jobs
-        self._on_done = on_done
+        self._ray, self._view, self._jobs, self._on_done = ray, view, jobs, on_done
         self._shared = shared
-        self._retries = retries
         self._toolkit = toolkit_digest()
         self._digests: dict[Folder, str] = {}
-        self._sent: dict[Folder, tuple[str, Any]] = {}
+        self._sent: dict[Folder, Any] = {}
+        # Of each job that waits: its index by Ray's reference, the number of its order, its place.
         self._pending: dict[Any, int] = {}
-        self._orders = 0
         self._numbers: dict[int, int] = {}
         self._places: dict[int, str] = {}
-        self._board = self._start_board()
-        self._news: Any = None
+        self._orders = 0
+        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+        # On the node that orders the jobs, so that no lost node takes the board along.
+        here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=True)
+        self._board = ray.remote(Board).options(num_cpus=0, scheduling_strategy=here).remote()
+        self._news: Any = self._board.read.remote()
 
     def all(self) -> None:
-        failures = Failures()
+        failures: list[HwpError] = []
         try:
             for index, job in enumerate(self._jobs):
                 if job.finished():
@@ -157,11 +134,11 @@ class _Run:
                     try:
                         self._take(index, reference)
                     except HwpError as error:
-                        failures.add(error)
+                        failures.append(error)
                         self._view.end(index, self._jobs[index].text, str(error))
         finally:
             self._cancel()
-        failures.raise_first(len(self._jobs))
+        raise_first(failures, len(self._jobs))
 
     def _take(self, index: int, reference: Any) -> None:
         job = self._jobs[index]
@@ -174,7 +151,7 @@ class _Run:
                 remedy="Install the same version of the toolkit on every node.",
             ) from error
         except self._ray.exceptions.RayError as error:
-            raise worker_lost_error(job.text, self._retries, type(error).__name__) from error
+            raise lost_error(job.text, type(error).__name__) from error
         if reply.missing:
             self._places.pop(index, None)
             self._view.drop(index)
@@ -201,23 +178,18 @@ class _Run:
             )
             for name, folder in job.inputs.items()
         }
+        environment = thread_environment(job.needs)
+        if job.needs.gpus == 0:
+            environment[VISIBLE_GPUS] = ""
         # Ray starts an order again by itself; a new number is an order that it never had.
-        number = self._orders
+        number = self._numbers[index] = self._orders
         self._orders += 1
-        self._numbers[index] = number
-        order = Order(
-            number,
-            job.work,
-            inputs,
-            thread_environment(job.needs),
-            job.needs.gpus > 0,
-            self._toolkit,
-        )
+        order = Order(number, job.work, inputs, environment, self._toolkit)
         task = self._ray.remote(run_order).options(
             name=job.text,
             num_cpus=job.needs.cpus,
             num_gpus=job.needs.gpus,
-            max_retries=self._retries,
+            max_retries=RETRIES,
         )
         self._pending[task.remote(order, sent, self._board)] = index
 
@@ -231,28 +203,17 @@ class _Run:
         if folder not in self._sent:
             parcel = pack(folder.path, folder.skip)
             self._digests[folder] = parcel.digest
-            self._sent[folder] = parcel.digest, self._ray.put(parcel)
-        return self._sent[folder][1]
-
-    def _start_board(self) -> Any:
-        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
-
-        # On the node that orders the jobs, so that no worker_lost_error node takes it along.
-        here = self._ray.get_runtime_context().get_node_id()
-        place = NodeAffinitySchedulingStrategy(here, soft=True)
-        return self._ray.remote(Board).options(num_cpus=0, scheduling_strategy=place).remote()
+            self._sent[folder] = self._ray.put(parcel)
+        return self._sent[folder]
 
     def _show(self) -> None:
-        # Asked for now, read when it is there: jobs do not wait for the news.
-        if self._news is None:
-            self._news = self._board.read.remote()
+        # Asked for before, read when it is there: jobs do not wait for the news.
         ready, _ = self._ray.wait([self._news], timeout=0)
         if not ready:
             return
-        try:
-            last: Mapping[int, tuple[str, int, int]] = self._ray.get(self._news)
-        except self._ray.exceptions.RayError:
-            last = {}
+        last: Mapping[int, tuple[str, int, int]] = {}
+        with contextlib.suppress(self._ray.exceptions.RayError):
+            last = self._ray.get(self._news)
         self._news = self._board.read.remote()
         for index in self._pending.values():
             place, done, total = last.get(self._numbers[index], ("", 0, 0))
@@ -264,9 +225,11 @@ class _Run:
 
     def _say_if_none_fits(self) -> None:
         nodes = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
-        waiting = {self._jobs[index].needs for index in self._pending.values()}
-        for needs in waiting:
-            if not any(_fits(needs, resources) for resources in nodes):
+        for needs in {self._jobs[index].needs for index in self._pending.values()}:
+            if not any(
+                node.get("CPU", 0) >= needs.cpus and node.get("GPU", 0) >= needs.gpus
+                for node in nodes
+            ):
                 self._view.say(
                     f"No node has {needs.cpus:g} processors and {needs.gpus:g} GPUs now; jobs "
                     "wait until one joins."
@@ -280,10 +243,6 @@ class _Run:
         if pending:
             self._ray.wait(pending, num_returns=len(pending), timeout=STOP_SECONDS)
         self._ray.kill(self._board)
-
-
-def _fits(needs: Needs, resources: Mapping[str, float]) -> bool:
-    return resources.get("CPU", 0) >= needs.cpus and resources.get("GPU", 0) >= needs.gpus
 
 
 # --- the connection, or why it fails, in bounded time
@@ -325,30 +284,20 @@ def check_head(address: str) -> None:
         socket.create_connection((host.strip("[]"), int(port)), CONNECT_SECONDS).close()
     except OSError as error:
         reason = error.strerror or str(error) or type(error).__name__
-        raise HwpError(
-            f"there is no Ray head at {address} ({reason})", field="--engine", remedy=_REMEDY
-        ) from error
+        problem = f"there is no Ray head at {address} ({reason})"
+        raise HwpError(problem, field="--engine", remedy=_REMEDY) from error
+    command = [sys.executable, "-c", _PROBE, address]
+    problem = ""
     try:
-        done = subprocess.run(
-            [sys.executable, "-c", _PROBE, address],
-            capture_output=True,
-            text=True,
-            timeout=ANSWER_SECONDS,
-            check=False,
-        )
-    except subprocess.TimeoutExpired as error:
-        raise HwpError(
-            f"{address} does not answer as a Ray head within {ANSWER_SECONDS:g} s",
-            field="--engine",
-            remedy=_REMEDY,
-        ) from error
-    if done.returncode != 0:
-        lines = done.stderr.strip().splitlines()
-        raise HwpError(
-            f"Ray at {address} refuses: {lines[-1][:300] if lines else 'it said nothing'}",
-            field="--engine",
-            remedy=_REMEDY,
-        )
+        done = subprocess.run(command, capture_output=True, text=True, timeout=ANSWER_SECONDS)
+    except subprocess.TimeoutExpired:
+        problem = f"{address} does not answer as a Ray head within {ANSWER_SECONDS:g} s"
+    else:
+        if done.returncode != 0:
+            said = [*done.stderr.strip().splitlines(), "it said nothing"][-2:][0]
+            problem = f"Ray at {address} refuses: {said[:300]}"
+    if problem:
+        raise HwpError(problem, field="--engine", remedy=_REMEDY)
 
 
 @contextlib.contextmanager
@@ -362,15 +311,13 @@ def connected(address: str | None) -> Iterator[Any]:
         check_head(address)
     main = threading.current_thread() is threading.main_thread()
     terminated = signal.getsignal(signal.SIGTERM) if main else None
-    quiet = {"log_to_driver": False, "logging_level": "error"}
-    with contextlib.redirect_stdout(_Tail()) as tail:
+    where = {"address": address or "local", **_QUIET}
+    with contextlib.redirect_stdout(io.StringIO()) as told:
         try:
-            if address is not None:
-                ray.init(address=address, **quiet)
-            else:
-                ray.init(address="local", include_dashboard=False, **quiet)
+            ray.init(**where, **({} if address else {"include_dashboard": False}))
         except (ConnectionError, OSError, RuntimeError, ValueError, SystemExit) as error:
-            reason = (str(error) or tail.last or type(error).__name__).splitlines()[0]
+            last = told.getvalue().strip().rpartition("\n")[2]
+            reason = (str(error) or last or type(error).__name__).splitlines()[0]
             raise HwpError(f"Ray cannot be reached: {reason[:300]}", field="--engine") from error
         if main:
             # Ray puts its own handler, which leaves without stopping the jobs.
@@ -381,21 +328,6 @@ def connected(address: str | None) -> Iterator[Any]:
             ray.shutdown()
 
 
-class _Tail(io.TextIOBase):
-    """A stream that keeps its last lines."""
-
-    def __init__(self) -> None:
-        self._lines: deque[str] = deque(maxlen=20)
-
-    def write(self, text: str) -> int:
-        self._lines.extend(text.splitlines())
-        return len(text)
-
-    @property
-    def last(self) -> str:
-        return self._lines[-1] if self._lines else ""
-
-
 # --- on a node: find the inputs, do the job, send the result
 
 
@@ -403,7 +335,6 @@ class _Tail(io.TextIOBase):
 class Input:
     """A folder that a job reads, by content."""
 
-    #: Digest of its content.
     digest: str
     #: Where it lies on the machine that orders; None where nodes must not look there.
     path: str | None
@@ -417,14 +348,10 @@ class Order:
 
     #: Number of this order; a job that is ordered again gets a new one.
     number: int
-    #: The work.
     work: Work
     #: The folders that it reads, by name.
     inputs: Mapping[str, Input]
-    #: Environment variables of the job.
     environment: Mapping[str, str]
-    #: Whether it may use the GPUs that Ray gives it.
-    gpus: bool
     #: Digest of the toolkit that ordered it.
     toolkit: str
 
@@ -433,7 +360,6 @@ class Order:
 class Reply:
     """The answer of a node: a result, or the names of missing inputs, or an error."""
 
-    #: The result folder.
     result: Parcel | None = None
     #: Names of inputs that must be sent.
     missing: tuple[str, ...] = ()
@@ -443,11 +369,9 @@ class Reply:
 
 def toolkit_digest() -> str:
     """Return the SHA-256 (hex) of the toolkit's source: what decides results besides inputs."""
-    root = PACKAGES
-    files = (path for package in SOURCES for path in (root / package).rglob("*"))
-    return files_digest(
-        root, (path for path in files if path.suffix in SUFFIXES and path.is_file())
-    )
+    files = (path for package in SOURCES for path in (PACKAGES / package).rglob("*"))
+    sources = (path for path in files if path.suffix in SUFFIXES and path.is_file())
+    return files_digest(PACKAGES, sources)
 
 
 @flushed()
@@ -509,24 +433,19 @@ def _is_shared(ordered: Input) -> bool:
 
 
 def _run(order: Order, inputs: Mapping[str, Path], tell: Any) -> Parcel:
-    environment = dict(order.environment)
-    if not order.gpus:
-        environment[VISIBLE_GPUS] = ""
     with tempfile.TemporaryDirectory(prefix="hwp-engine-") as name:
         scratch = Path(name)
         output = scratch / "result"
-        job = LocalJob(order.work, inputs, output, environment, (scratch,))
-        for attempt in range(RETRIES + 1):
+        job = LocalJob(order.work, inputs, output, order.environment, (scratch,))
+        for _ in range(RETRIES + 1):
             with contextlib.suppress(WorkerLost):
                 run_in_process(job, tell, lambda: False)
-                break
-            if attempt == RETRIES:
-                raise HwpError(
-                    f"the process of a job was killed {RETRIES + 1} times",
-                    where=socket.gethostname(),
-                    remedy="Is there enough memory? Ask for more processors with --job-cpus.",
-                )
-        return pack(output)
+                return pack(output)
+    raise HwpError(
+        f"the process of a job was killed {RETRIES + 1} times",
+        where=socket.gethostname(),
+        remedy="Is there enough memory? Ask for more processors with --job-cpus.",
+    )
 
 
 class Board:
@@ -553,52 +472,54 @@ class Parcel:
 
     #: Digest of its content, as `folder_digest` says it.
     digest: str
-    #: The bytes.
     data: bytes
 
 
-def folder_digest(root: Path, skip: Sequence[str] = ()) -> str:
-    """Return the SHA-256 (hex) of a folder: names, content, and which files can be executed.
+class _Sink:
+    """Takes an archive that is written to it: its digest, and its bytes where they are kept."""
 
-    `skip` are names directly inside it that do not count.
-    """
-    return _pack(root, skip, None)
+    def __init__(self, kept: bytearray | None = None) -> None:
+        self._hash = hashlib.sha256()
+        self._kept = kept
+
+    def write(self, data: bytes) -> int:
+        self._hash.update(data)
+        if self._kept is not None:
+            self._kept += data
+        return len(data)
+
+    def flush(self) -> None:
+        """Nothing waits."""
+
+    def take(self, root: Path, skip: Sequence[str]) -> str:
+        """Take a folder: names, contents, and which files can be executed; returns the digest."""
+        with zipfile.ZipFile(cast(BinaryIO, self), "w", zipfile.ZIP_STORED) as archive:
+            for name, path in _entries(root, skip):
+                if path.is_dir():
+                    archive.writestr(zipfile.ZipInfo(f"{name}/", _EPOCH), b"")
+                    continue
+                info = zipfile.ZipInfo(name, _EPOCH)
+                facts = path.stat()
+                info.file_size = facts.st_size
+                info.external_attr = (0o755 if facts.st_mode & stat.S_IXUSR else 0o644) << 16
+                try:
+                    with open(path, "rb") as source, archive.open(info, "w") as target:
+                        shutil.copyfileobj(source, target)
+                except OSError as error:
+                    raise BadInput(f"cannot be read ({error.strerror})", where=path) from error
+        return self._hash.hexdigest()
+
+
+def folder_digest(root: Path, skip: Sequence[str] = ()) -> str:
+    """Return the SHA-256 (hex) of a folder; `skip` are names directly inside that do not count."""
+    return _Sink().take(root, skip)
 
 
 def pack(root: Path, skip: Sequence[str] = ()) -> Parcel:
     """Pack a folder; the digest is that of the bytes that are sent."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
-        digest = _pack(root, skip, archive)
-    return Parcel(digest, buffer.getvalue())
-
-
-def _pack(root: Path, skip: Sequence[str], archive: zipfile.ZipFile | None) -> str:
-    """Read a folder in one order, into an archive if there is one; returns its digest."""
-    total = hashlib.sha256()
-    for name, path in _entries(root, skip):
-        if path.is_dir():
-            total.update(f"d\0{name}\0".encode())
-            if archive is not None:
-                archive.writestr(zipfile.ZipInfo(f"{name}/", _EPOCH), b"")
-            continue
-        executable = path.stat().st_mode & stat.S_IXUSR
-        try:
-            with open(path, "rb") as stream:
-                content = None if archive is None else stream.read()
-                digest = (
-                    hashlib.file_digest(stream, "sha256")
-                    if content is None
-                    else hashlib.sha256(content)
-                )
-        except OSError as error:
-            raise BadInput(f"cannot be read ({error.strerror})", where=path) from error
-        total.update(f"{'x' if executable else 'f'}\0{name}\0".encode() + digest.digest())
-        if archive is not None and content is not None:
-            info = zipfile.ZipInfo(name, _EPOCH)
-            info.external_attr = (0o755 if executable else 0o644) << 16
-            archive.writestr(info, content)
-    return total.hexdigest()
+    data = bytearray()
+    digest = _Sink(data).take(root, skip)
+    return Parcel(digest, bytes(data))
 
 
 def unpack(parcel: Parcel, target: Path, *, replace: bool = False) -> None:
@@ -609,7 +530,7 @@ def unpack(parcel: Parcel, target: Path, *, replace: bool = False) -> None:
         temporary.mkdir()
         try:
             _extract(parcel.data, temporary)
-            if folder_digest(temporary) != parcel.digest:
+            if hashlib.sha256(parcel.data).hexdigest() != parcel.digest:
                 raise BadInput("arrived damaged: its digest is different", where=target)
             _swap(temporary, target, replace)
         finally:
@@ -651,7 +572,7 @@ def _extract(data: bytes, root: Path) -> None:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 # Written as plain files whatever the archive calls them, so there are no links.
                 with archive.open(item) as source, open(path, "xb") as stream:
-                    shutil.copyfileobj(source, stream, _CHUNK)
+                    shutil.copyfileobj(source, stream)
                 if item.external_attr >> 16 & 0o100:
                     # Whoever may read it may run it; the rest of the mode is the umask's.
                     mode = path.stat().st_mode
@@ -666,7 +587,11 @@ def _entries(root: Path, skip: Sequence[str]) -> Iterator[tuple[str, Path]]:
         raise BadInput("is not a folder", where=root)
     found: list[tuple[str, Path]] = []
     size = 0
-    for folder, folders, files in os.walk(root, onerror=_refuse):
+
+    def refuse(error: OSError) -> None:
+        raise BadInput(f"cannot be read ({error.strerror})", where=error.filename) from error
+
+    for folder, folders, files in os.walk(root, onerror=refuse):
         top = Path(folder) == root
         left_out = LEFT_OUT | set(skip) if top else LEFT_OUT
         folders[:] = [name for name in folders if name not in left_out]
@@ -688,7 +613,3 @@ def _entries(root: Path, skip: Sequence[str]) -> Iterator[tuple[str, Path]]:
             remedy=f"At most {MAX_ENTRIES} files of {MAX_BYTES >> 30} GiB.",
         )
     yield from sorted(found)
-
-
-def _refuse(error: OSError) -> None:
-    raise BadInput(f"cannot be read ({error.strerror})", where=error.filename) from error

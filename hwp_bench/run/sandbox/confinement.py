@@ -18,8 +18,10 @@ from pathlib import Path
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import cache_root
 from hwp_bench.base.numerics import OPENCV_WAITING, OPENMP_WAITING, TORCH_COUNTS
-from hwp_bench.base.packages import PACKAGES, data_folder
+from hwp_bench.base.packages import PACKAGES
 from hwp_bench.methods.contents import is_foreign
+from hwp_bench.methods.manifest import ships
+from hwp_bench.metrics.lpips import torch_home
 from hwp_bench.run.sandbox.launch import Place
 from hwp_bench.run.sandbox.supervise import SCRATCH, SCRATCH_BYTES, default_limit, scratch_bytes
 
@@ -38,42 +40,20 @@ MAX_FOLDERS = 20_000
 MODES = ("auto", "required", "none")
 #: Environment variables that a method's process inherits in any case.
 INHERITED = (
-    "CUDA_VISIBLE_DEVICES",
-    "LANG",
-    "LC_ALL",
-    "LD_LIBRARY_PATH",
-    "NUMBA_NUM_THREADS",
+    *("CUDA_VISIBLE_DEVICES", "LANG", "LC_ALL", "LD_LIBRARY_PATH", "PATH", "PYTHONPATH"),
+    *("VIRTUAL_ENV", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "GOTO_NUM_THREADS"),
     *OPENMP_WAITING,
     *OPENCV_WAITING,
     *TORCH_COUNTS,
-    "OPENBLAS_NUM_THREADS",
-    "GOTO_NUM_THREADS",
-    "PATH",
-    "PYTHONPATH",
-    "VIRTUAL_ENV",
 )
 #: Variables that name folders, which exist only where it runs without a sandbox.
-INHERITED_FOLDERS = (
-    "HOME",
-    "TMPDIR",
-    "TORCH_HOME",
-    "XDG_CACHE_HOME",
-)
+INHERITED_FOLDERS = ("HOME", "TMPDIR", "TORCH_HOME", "XDG_CACHE_HOME")
 # Programs and libraries. /usr/local and CUDA's usual places are inside.
 _SYSTEM = ("usr", "bin", "sbin", "lib", "lib32", "lib64", "libx32", "opt", "nix/store", "gnu/store")
 # Of /etc only what programs look up; not, for example, /etc/shadow.
 _ETC = (
-    "OpenCL",
-    "alternatives",
-    "fonts",
-    "group",
-    "hosts",
-    "ld.so.cache",
-    "ld.so.conf",
-    "ld.so.conf.d",
-    "localtime",
-    "nsswitch.conf",
-    "passwd",
+    *("OpenCL", "alternatives", "fonts", "group", "hosts", "ld.so.cache", "ld.so.conf"),
+    *("ld.so.conf.d", "localtime", "nsswitch.conf", "passwd"),
 )
 # Of /sys what tells processors, memory and accelerators; not firmware, nor the kernel's tracing.
 _SYS = ("bus", "class", "dev", "devices", "fs/cgroup", "kernel/mm", "module")
@@ -151,17 +131,17 @@ def sandbox_environment(
         "HOME": str(home.resolve()),
         **_cache_environment(method, output),
     }
-    weights = _torch_home()
+    weights = torch_home()
     if weights.is_dir():
         environment["TORCH_HOME"] = str(weights)
     shown = {os.path.realpath(path) for path in confinement.exposed}
     foreign = [path for path in foreign_folders(method.resolve()) if path not in shown]
     kernels = _kernels()
-    writable = [output, kernels] if KEPT_KERNELS in environment else [output]
+    cache = [] if os.path.realpath(cache_root()) in shown else [cache_root().absolute()]
     places = visible_places(
         read=[method, request, weights, kernels, *_libraries(), *confinement.exposed],
-        write=writable,
-        hidden=[*map(Path, foreign), *_unless(shown, cache_root()), *confinement.hidden],
+        write=[output, kernels] if KEPT_KERNELS in environment else [output],
+        hidden=[*map(Path, foreign), *cache, *confinement.hidden],
         scratch=scratch_bytes(confinement.memory_bytes),
     )
     return environment, places
@@ -200,21 +180,11 @@ def _taken(names: Sequence[str]) -> dict[str, str]:
     return {name: os.environ[name] for name in names if name in os.environ}
 
 
-def _unless(shown: set[str], folder: Path) -> list[Path]:
-    return [] if os.path.realpath(folder) in shown else [folder.absolute()]
-
-
 def _libraries() -> list[Path]:
     """Folders of `PYTHONPATH`."""
     entries = os.environ.get("PYTHONPATH", "").split(os.pathsep)
     absolute = [entry for entry in entries if os.path.isabs(entry)]
     return [Path(path) for entry in absolute for path in package_paths(entry)]
-
-
-def _torch_home() -> Path:
-    """Folder of torch's downloaded weights, which methods may read but not write."""
-    cache = os.environ.get("XDG_CACHE_HOME", "~/.cache")
-    return Path(os.environ.get("TORCH_HOME") or f"{cache}/torch").expanduser()
 
 
 def _cache_environment(method: Path, output: Path) -> dict[str, str]:
@@ -229,7 +199,7 @@ def _cache_environment(method: Path, output: Path) -> dict[str, str]:
         "NUMBA_CACHE_DIR": str(cache / "numba"),
         "HWP_KERNELS": str(_kernels()),
     }
-    if _ships(method):
+    if ships(method):
         with contextlib.suppress(OSError):
             _kernels().mkdir(mode=0o700, parents=True, exist_ok=True)
             environment[KEPT_KERNELS] = str(_kernels())
@@ -238,12 +208,6 @@ def _cache_environment(method: Path, output: Path) -> dict[str, str]:
 
 def _kernels() -> Path:
     return cache_root().absolute() / "kernels"
-
-
-def _ships(method: Path) -> bool:
-    """Whether a method is a part of this installation of the toolkit."""
-    real = method.resolve()
-    return any(map(real.is_relative_to, (data_folder("baselines"), PACKAGES / "wildghand")))
 
 
 # --- the file system
@@ -312,13 +276,13 @@ def _resolved(path: str) -> tuple[list[tuple[str, str]], str]:
 
 def python_places() -> list[str]:
     """Return the folders of this interpreter, its packages and the toolkit."""
-    sites = _sites()
-    linked = [path for folder in _linked(sites) for path in package_paths(folder)]
+    sites = [*site.getsitepackages(), site.getusersitepackages()]
+    # The folders that `.pth` files add, as editable installs do.
+    files = [Path(path) for folder in sites for path in glob(f"{folder}/*.pth")]
+    lines = [line for file in files for line in file.read_text(errors="replace").splitlines()]
+    folders = [line.strip() for line in lines if os.path.isabs(line)]
+    linked = [path for one in folders if os.path.isdir(one) for path in package_paths(one)]
     return [sys.prefix, sys.base_prefix, *package_paths(os.fspath(PACKAGES)), *sites, *linked]
-
-
-def _sites() -> list[str]:
-    return [*site.getsitepackages(), site.getusersitepackages()]
 
 
 def package_paths(folder: str) -> list[str]:
@@ -345,13 +309,6 @@ def _is_checkout(folder: str) -> bool:
     return all(os.path.isfile(os.path.join(folder, file)) for file in files)
 
 
-def _linked(sites: Iterable[str]) -> list[str]:
-    """Return the folders that `.pth` files add, as editable installs do."""
-    files = [path for folder in sites for path in glob(f"{folder}/*.pth")]
-    lines = [line for path in files for line in Path(path).read_text(errors="replace").splitlines()]
-    return [line.strip() for line in lines if os.path.isabs(line) and os.path.isdir(line.strip())]
-
-
 # --- what stays out of sight although it lies in a folder that is shown
 
 
@@ -363,12 +320,8 @@ def hidden_packages(folders: Iterable[str]) -> list[str]:
     """
     found = []
     for folder in folders:
-        above = [
-            folder,
-            os.path.dirname(folder),
-            *glob(f"{escape(folder)}/lib*/python*/*-packages"),
-        ]
-        for place in above:
+        inside = glob(f"{escape(folder)}/lib*/python*/*-packages")
+        for place in (folder, os.path.dirname(folder), *inside):
             package = os.path.join(place, "hwp_bench")
             # A name alone would hide somebody else's folder of that name.
             if os.path.isfile(os.path.join(package, "__init__.py")):

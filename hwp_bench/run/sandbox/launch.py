@@ -31,13 +31,9 @@ _OLD, _NEW = "/old", "/new"
 #: writable folder; the third word is its size, bytes), `link` (a symbolic link; its target) and
 #: `proc` (the process table, read-only).
 Place = tuple[str, str, str]
-_NAMESPACES = (
-    syscalls.CLONE_NEWUSER
-    | syscalls.CLONE_NEWNS
-    | syscalls.CLONE_NEWPID
-    | syscalls.CLONE_NEWNET
-    | syscalls.CLONE_NEWIPC
-)
+_NAMESPACES = syscalls.CLONE_NEWUSER | syscalls.CLONE_NEWNS | syscalls.CLONE_NEWPID
+_NAMESPACES |= syscalls.CLONE_NEWNET | syscalls.CLONE_NEWIPC
+_QUIET = syscalls.MS_NOSUID | syscalls.MS_NODEV
 # Most seconds that are spent on ending descendants; a storm of forks could go on for ever.
 _PATIENCE = 5.0
 
@@ -52,26 +48,20 @@ def main(report: int) -> None:
     """
     order = json.loads(sys.stdin.buffer.read())
     os.set_inheritable(report, False)
-    silence = os.open(os.devnull, os.O_RDWR)
-    os.dup2(silence, 0)
-    os.close(silence)
+    with open(os.devnull, "r+b", buffering=0) as silence:
+        os.dup2(silence.fileno(), 0)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    _offer_to_oom_killer()
+    # The kernel ends the method first, not the toolkit, when the machine's memory runs out.
+    with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "w") as stream:
+        stream.write("1000")
     # Where the system has no keys or forbids the call, there is nothing to be left behind.
     with contextlib.suppress(OSError):
         syscalls.leave_session_keyring()
     try:
-        run = _run_in_namespaces if order["places"] is not None else _run_watched
-        answer = run(order)
+        answer = _run_watched(order) if order["places"] is None else _run_in_namespaces(order)
     except OSError as error:
         answer = {"stage": "sandbox", "problem": str(error.args[-1])}
     os.write(report, json.dumps(answer).encode())
-
-
-def _offer_to_oom_killer() -> None:
-    """Have the kernel end the method first, not the toolkit, when the machine's memory runs out."""
-    with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "w") as stream:
-        stream.write("1000")
 
 
 def _run_watched(order: dict[str, Any]) -> dict[str, Any]:
@@ -234,12 +224,11 @@ def enter_root(places: Sequence[Place]) -> None:
 
     It must be in a mount namespace of its own, and the first process of its process namespace.
     """
-    quiet = syscalls.MS_NOSUID | syscalls.MS_NODEV
     syscalls.mount("", "/", "", syscalls.MS_REC | syscalls.MS_SLAVE)
-    syscalls.mount("tmpfs", _STAGE, "tmpfs", quiet, "size=16m,mode=755")
+    _tmpfs(_STAGE, "size=16m,mode=755")
     for name in (_OLD, _NEW):
         os.mkdir(_STAGE + name)
-    syscalls.mount("tmpfs", _STAGE + _NEW, "tmpfs", quiet, "size=16m,mode=755")
+    _tmpfs(_STAGE + _NEW, "size=16m,mode=755")
     syscalls.pivot_root(_STAGE, _STAGE + _OLD)
     os.chdir("/")
     # A hidden folder is one only where a place that is shown contains it.
@@ -273,7 +262,7 @@ def _show(place: Place) -> str | None:
         syscalls.set_attributes(here, attributes)
     elif kind == "proc":
         os.makedirs(here, exist_ok=True)
-        syscalls.mount("proc", here, "proc", syscalls.MS_NOSUID | syscalls.MS_NODEV)
+        syscalls.mount("proc", here, "proc", _QUIET)
         _restrict_machine(here)
     elif kind == "scratch":
         os.makedirs(here, exist_ok=True)
@@ -307,7 +296,7 @@ def _mount_point(path: str, *, folder: bool) -> None:
 
 
 def _tmpfs(path: str, options: str) -> None:
-    syscalls.mount("tmpfs", path, "tmpfs", syscalls.MS_NOSUID | syscalls.MS_NODEV, options)
+    syscalls.mount("tmpfs", path, "tmpfs", _QUIET, options)
 
 
 def _restrict(path: str) -> None:

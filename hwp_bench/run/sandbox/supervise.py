@@ -22,8 +22,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
-from hwp_bench.base.errors import MethodFailed, shown
-from hwp_bench.base.folders import open_up
+from hwp_bench.base.errors import MethodFailed, reason_of, shown
 from hwp_bench.base.packages import PACKAGES
 from hwp_bench.run.sandbox.launch import Place
 
@@ -57,11 +56,9 @@ _LAUNCH = (
 class Program:
     """An untrusted program: what is run, and where."""
 
-    #: The words of its command.
+    #: Its command, its working folder, and all its environment variables.
     command: Sequence[str]
-    #: Its working folder.
     folder: Path
-    #: All its environment variables.
     environment: Mapping[str, str]
     #: The places of the file system that it sees; None starts it without namespaces.
     places: Sequence[Place] | None
@@ -108,10 +105,9 @@ def run_confined(
     # that is not there yet.
     log = _open_log(program.log, log_problems)
     read, write = os.pipe()
-    root = os.fspath(PACKAGES)
-    bare = [sys.executable, "-I", "-S", "-B", "-c", _LAUNCH.format(root=root) + f"main({write})"]
+    start = _LAUNCH.format(root=os.fspath(PACKAGES)) + f"main({write})"
     process = subprocess.Popen(
-        bare,
+        [sys.executable, "-I", "-S", "-B", "-c", start],
         env=dict(program.environment),
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
@@ -120,15 +116,24 @@ def run_confined(
         pass_fds=(write,),
     )
     os.close(write)
-    watch = _Watch(process, limits, _join_group(process, limits))
+    # It still waits for its order.
+    watch = _Watch(process, limits, control_group(limits.memory, process.pid))
     assert process.stdin is not None
     assert process.stdout is not None
     drain = threading.Thread(target=_drain, args=(process.stdout, log, log_problems), daemon=True)
     drain.start()
+    order = {
+        "command": list(program.command),
+        "folder": os.fspath(program.folder),
+        "environment": dict(program.environment),
+        "places": program.places,
+        "parent": os.getpid(),
+        "memory_files": program.memory_files,
+    }
     with os.fdopen(read, "rb") as report:
         try:
             with contextlib.suppress(BrokenPipeError):
-                process.stdin.write(_order(program))
+                process.stdin.write(json.dumps(order).encode())
                 process.stdin.close()
             stopped = watch.wait(on_poll)
         finally:
@@ -139,10 +144,8 @@ def run_confined(
             starved = watch.finish()
         text = report.read()
     lost = log_problems[0] if log_problems else None
-    if stopped is not None:
-        return ProcessOutcome(None, stopped, log_problem=lost)
-    if watch.over:
-        return ProcessOutcome(None, "memory", log_problem=lost)
+    if stopped is not None or watch.over:
+        return ProcessOutcome(None, stopped or "memory", log_problem=lost)
     answer: dict[str, Any] = json.loads(text) if text else {"status": process.returncode}
     if answer.get("stage") == "sandbox":
         return ProcessOutcome(None, refused=answer["problem"])
@@ -156,18 +159,6 @@ def run_confined(
     return ProcessOutcome(answer["status"], starved=starved, log_problem=lost)
 
 
-def _order(program: Program) -> bytes:
-    order = {
-        "command": list(program.command),
-        "folder": os.fspath(program.folder),
-        "environment": dict(program.environment),
-        "places": program.places,
-        "parent": os.getpid(),
-        "memory_files": program.memory_files,
-    }
-    return json.dumps(order).encode()
-
-
 def _unseen(word: str) -> str:
     """What may be wrong with a program that cannot be started inside the walls."""
     leads = ""
@@ -179,19 +170,6 @@ def _unseen(word: str) -> str:
         f"not what links in that folder lead to.{leads} If you trust it and it needs another "
         "interpreter, show it with --expose, its environment and what that was made from."
     )
-
-
-def _join_group(process: subprocess.Popen[bytes], limits: Limits) -> ControlGroup | None:
-    """Put a launcher into a control group, where there can be one; it still waits for its order."""
-    group = control_group(limits.memory)
-    if group is None:
-        return None
-    try:
-        group.take(process.pid)
-    except OSError:
-        group.remove()
-        return None
-    return group
 
 
 class _Watch:
@@ -266,15 +244,6 @@ def _end(process: subprocess.Popen[bytes]) -> None:
     process.wait()
 
 
-def remove_odd_files(folder: Path) -> None:
-    """Remove links, pipes, sockets and devices from a folder and all folders in it, and open it.
-
-    A link that leads nowhere inside a sandbox leads to real files outside it: the toolkit would
-    read a test frame for a prediction. To be called when no process of the program is left.
-    """
-    open_up(folder)
-
-
 # --- the log
 
 
@@ -284,7 +253,7 @@ def _open_log(path: Path, problems: list[str]) -> io.FileIO | None:
     try:
         return io.FileIO(os.open(path, flags, 0o666), "wb")
     except OSError as error:
-        problems.append(_why(error))
+        problems.append(reason_of(error))
         return None
 
 
@@ -299,13 +268,9 @@ def _drain(stream: IO[bytes], log: io.FileIO | None, problems: list[str]) -> Non
             with log:
                 _keep_ends(stream, log)
         except OSError as error:
-            problems.append(_why(error))
+            problems.append(reason_of(error))
     while os.read(stream.fileno(), 65536):
         pass
-
-
-def _why(error: OSError) -> str:
-    return error.strerror or type(error).__name__
 
 
 def _keep_ends(stream: IO[bytes], target: io.FileIO) -> None:
@@ -366,8 +331,13 @@ def machine_is_short() -> bool:
 
 def kernel_kills() -> int:
     """Return how many processes the kernel has ended for want of memory since the start."""
-    with contextlib.suppress(OSError, ValueError), open("/proc/vmstat") as table:
-        for line in table:
+    return _kills("/proc/vmstat")
+
+
+def _kills(table: str | Path) -> int:
+    """The kills for want of memory that a table of the kernel counts; 0 where it tells none."""
+    with contextlib.suppress(OSError, ValueError), open(table) as lines:
+        for line in lines:
             name, _, count = line.partition(" ")
             if name == "oom_kill":
                 return int(count)
@@ -446,8 +416,7 @@ def _proportional(processes: Iterable[int], unowned: int) -> int:
     """Memory with shares of what several hold; mapped files in memory are among `unowned`."""
     own, mapped = 0, 0
     for process in processes:
-        table = _table(process, "smaps_rollup")
-        if table:
+        if table := _table(process, "smaps_rollup"):
             own += sum(table.get(name, 0) for name in (b"Pss_Anon", b"Pss_File", b"SwapPss"))
             own += _table(process, "status").get(b"VmPTE", 0)
             mapped += table.get(b"Pss_Shmem", 0)
@@ -489,40 +458,27 @@ def _memory_files(processes: Iterable[int]) -> int:
 class ControlGroup:
     """A group of processes whose memory the kernel limits; it also counts what no process holds."""
 
-    #: Its folder.
     folder: Path
-
-    def take(self, process: int) -> None:
-        """Put a process into it, and with it all that it starts."""
-        (self.folder / "cgroup.procs").write_text(str(process))
 
     def kills(self) -> int:
         """Return how many of its processes the kernel has ended, because they took too much."""
-        with contextlib.suppress(OSError, ValueError):
-            for line in (self.folder / "memory.events").read_text().splitlines():
-                name, _, count = line.partition(" ")
-                if name == "oom_kill":
-                    return int(count)
-        return 0
+        return _kills(self.folder / "memory.events")
 
     def remove(self) -> None:
         """Remove it; its processes must have ended."""
         # The kernel may still be at work on the last one.
         for _ in range(50):
-            try:
+            with contextlib.suppress(OSError):
                 self.folder.rmdir()
-            except FileNotFoundError:
+            if not self.folder.is_dir():
                 return
-            except OSError:
-                time.sleep(0.02)
-            else:
-                return
+            time.sleep(0.02)
 
 
 def control_group(
-    limit: int, mounted: Path = _CONTROL, own: str | None = None
+    limit: int, process: int, mounted: Path | None = None, own: str | None = None
 ) -> ControlGroup | None:
-    """Make a control group for one run; None where this user or system has none.
+    """Put a process into a new group, with all that it starts; None where there can be none.
 
     Only the second edition of control groups is used (cgroup v2).
     """
@@ -530,29 +486,26 @@ def control_group(
         own = ""
         with contextlib.suppress(OSError), open("/proc/self/cgroup") as table:
             own = table.read()
-    for above in _above(mounted, own):
-        _remove_old(above)
+    for above in _above(mounted or _CONTROL, own):
+        # Those that killed runs have left; one with processes in it stays.
+        for left in above.glob(f"{_PREFIX}*"):
+            with contextlib.suppress(OSError):
+                # A new one is empty until its first process comes.
+                if time.time() - left.stat().st_mtime > _NEW_SECONDS:
+                    left.rmdir()
         group = ControlGroup(above / f"{_PREFIX}{secrets.token_hex(6)}")
         try:
             group.folder.mkdir()
             (group.folder / "memory.max").write_text(str(limit))
+            for name, value in (("memory.swap.max", "0"), ("memory.oom.group", "1")):
+                with contextlib.suppress(OSError):
+                    (group.folder / name).write_text(value)
+            (group.folder / "cgroup.procs").write_text(str(process))
         except OSError:
             group.remove()
-            continue
-        for name, value in (("memory.swap.max", "0"), ("memory.oom.group", "1")):
-            with contextlib.suppress(OSError):
-                (group.folder / name).write_text(value)
-        return group
+        else:
+            return group
     return None
-
-
-def _remove_old(above: Path) -> None:
-    """Remove groups that killed runs have left; one with processes in it stays."""
-    for folder in above.glob(f"{_PREFIX}*"):
-        with contextlib.suppress(OSError):
-            # A new one is empty until its first process comes.
-            if time.time() - folder.stat().st_mtime > _NEW_SECONDS:
-                folder.rmdir()
 
 
 def _above(mounted: Path, own: str) -> Iterable[Path]:
@@ -565,12 +518,7 @@ def _above(mounted: Path, own: str) -> Iterable[Path]:
         if line.startswith("0::/"):
             here = mounted / line[4:]
             for folder in (here, here.parent):
-                inside = folder.is_relative_to(mounted) and ".." not in folder.parts
-                if inside and _limits_memory(folder):
-                    yield folder
-
-
-def _limits_memory(folder: Path) -> bool:
-    with contextlib.suppress(OSError):
-        return "memory" in (folder / "cgroup.subtree_control").read_text().split()
-    return False
+                if folder.is_relative_to(mounted) and ".." not in folder.parts:
+                    with contextlib.suppress(OSError):
+                        if "memory" in (folder / "cgroup.subtree_control").read_text().split():
+                            yield folder

@@ -13,7 +13,7 @@ import errno
 import os
 import struct
 from collections.abc import Iterable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 CLONE_NEWNS = 0x00020000
 CLONE_NEWIPC = 0x08000000
@@ -31,10 +31,6 @@ MOUNT_ATTR_NOSUID = 0x2
 _MNT_DETACH = 2
 _AT_FDCWD = -100
 _AT_RECURSIVE = 0x8000
-#: The same number on every architecture, unlike those of older calls.
-_SYS_MOUNT_SETATTR = 442
-# keyctl(2), add_key(2) and their kind have numbers that differ.
-_SYS_KEYCTL = {"x86_64": 250, "aarch64": 219, "riscv64": 219}
 _KEYCTL_JOIN_SESSION_KEYRING = 1
 _PR_SET_SECCOMP = 22
 _SECCOMP_MODE_FILTER = 2
@@ -43,85 +39,32 @@ _PR_CAPBSET_DROP = 24
 _PR_SET_CHILD_SUBREAPER = 36
 _PR_SET_NO_NEW_PRIVS = 38
 _CAPABILITY_VERSION_3 = 0x20080522
-# Numbers of <asm/unistd.h>: x86_64, and the table that newer architectures share.
+# Numbers of <asm/unistd.h>: x86_64, the table that newer architectures share, and calls whose
+# numbers are the same everywhere.
+# fmt: off
 _X86 = {
-    "open": 2,
-    "shmget": 29,
-    "socket": 41,
-    "socketpair": 53,
-    "clone": 56,
-    "msgget": 68,
-    "creat": 85,
-    "chmod": 90,
-    "fchmod": 91,
-    "syslog": 103,
-    "mknod": 133,
-    "sched_setscheduler": 144,
-    "pivot_root": 155,
-    "prctl": 157,
-    "mount": 165,
-    "umount2": 166,
-    "add_key": 248,
-    "request_key": 249,
-    "keyctl": 250,
-    "openat": 257,
-    "mknodat": 259,
-    "fchmodat": 268,
-    "unshare": 272,
-    "perf_event_open": 298,
-    "open_by_handle_at": 304,
-    "setns": 308,
-    "sched_setattr": 314,
-    "memfd_create": 319,
-    "bpf": 321,
-    "userfaultfd": 323,
+    "open": 2, "shmget": 29, "socket": 41, "socketpair": 53, "clone": 56, "msgget": 68,
+    "creat": 85, "chmod": 90, "fchmod": 91, "syslog": 103, "mknod": 133,
+    "sched_setscheduler": 144, "pivot_root": 155, "prctl": 157, "mount": 165, "umount2": 166,
+    "add_key": 248, "request_key": 249, "keyctl": 250, "openat": 257, "mknodat": 259,
+    "fchmodat": 268, "unshare": 272, "perf_event_open": 298, "open_by_handle_at": 304,
+    "setns": 308, "sched_setattr": 314, "memfd_create": 319, "bpf": 321, "userfaultfd": 323,
 }
 _SHARED = {
-    "mknodat": 33,
-    "umount2": 39,
-    "mount": 40,
-    "pivot_root": 41,
-    "fchmod": 52,
-    "fchmodat": 53,
-    "openat": 56,
-    "unshare": 97,
-    "syslog": 116,
-    "sched_setscheduler": 119,
-    "prctl": 167,
-    "msgget": 186,
-    "shmget": 194,
-    "socket": 198,
-    "socketpair": 199,
-    "add_key": 217,
-    "request_key": 218,
-    "keyctl": 219,
-    "clone": 220,
-    "perf_event_open": 241,
-    "open_by_handle_at": 265,
-    "setns": 268,
-    "sched_setattr": 274,
-    "memfd_create": 279,
-    "bpf": 280,
-    "userfaultfd": 282,
+    "mknodat": 33, "umount2": 39, "mount": 40, "pivot_root": 41, "fchmod": 52, "fchmodat": 53,
+    "openat": 56, "unshare": 97, "syslog": 116, "sched_setscheduler": 119, "prctl": 167,
+    "msgget": 186, "shmget": 194, "socket": 198, "socketpair": 199, "add_key": 217,
+    "request_key": 218, "keyctl": 219, "clone": 220, "perf_event_open": 241,
+    "open_by_handle_at": 265, "setns": 268, "sched_setattr": 274, "memfd_create": 279,
+    "bpf": 280, "userfaultfd": 282,
 }
-# The same everywhere.
 _NEWER = {
-    "io_uring_setup": 425,
-    "io_uring_enter": 426,
-    "io_uring_register": 427,
-    "open_tree": 428,
-    "move_mount": 429,
-    "fsopen": 430,
-    "fsconfig": 431,
-    "fsmount": 432,
-    "fspick": 433,
-    "clone3": 435,
-    "openat2": 437,
-    "mount_setattr": 442,
-    "memfd_secret": 447,
-    "fchmodat2": 452,
+    "io_uring_setup": 425, "io_uring_enter": 426, "io_uring_register": 427, "open_tree": 428,
+    "move_mount": 429, "fsopen": 430, "fsconfig": 431, "fsmount": 432, "fspick": 433,
+    "clone3": 435, "openat2": 437, "mount_setattr": 442, "memfd_secret": 447, "fchmodat2": 452,
     "open_tree_attr": 467,
 }
+# fmt: on
 # <linux/audit.h>, and numbers above which x86_64 has a second table (x32).
 _ARCHITECTURES = {
     "x86_64": (0xC000003E, _X86),
@@ -155,6 +98,8 @@ _FAMILIES = (1, 2, 10, 16)
 _LOAD, _EQUAL, _AT_LEAST, _ANY_BIT, _RETURN = 0x20, 0x15, 0x35, 0x45, 0x06
 _ALLOW, _ERROR = 0x7FFF0000, 0x00050000
 _NUMBER_AT, _ARCHITECTURE_AT, _ARGUMENTS_AT = 0, 4, 16
+# Operation, instructions to skip where it holds and where not, and its number.
+_Instruction = tuple[int, int, int, int]
 
 
 class Refused(OSError):
@@ -188,6 +133,19 @@ def _libc() -> ctypes.CDLL:
     return ctypes.CDLL(None, use_errno=True)
 
 
+def _system_call(step: str, name: str, *arguments: object) -> None:
+    """Make a call that the C library has no function for."""
+    _, table = _ARCHITECTURES.get(os.uname().machine, (0, _NEWER))
+    number = {**table, **_NEWER}.get(name)
+    if number is None:
+        raise Refused(errno.ENOSYS, f"{step}: not known on {os.uname().machine}")
+    _checked(_libc().syscall(number, *arguments), step)
+
+
+def _prctl(option: int, value: int, step: str) -> None:
+    _checked(_libc().prctl(option, value, 0, 0, 0), step)
+
+
 def unshare(flags: int) -> None:
     """Leave the namespaces that `flags` name for new ones (unshare(2))."""
     _checked(_libc().unshare(flags), "new namespaces")
@@ -203,15 +161,10 @@ def mount(source: str, target: str, kind: str, flags: int, options: str = "") ->
 def set_attributes(target: str, attributes: int, *, recursive: bool = True) -> None:
     """Add restrictions to a mount and, by default, to those below it (mount_setattr(2))."""
     restrictions = _MountAttributes(attributes, 0, 0, 0)
-    result = _libc().syscall(
-        _SYS_MOUNT_SETATTR,
-        _AT_FDCWD,
-        os.fsencode(target),
-        _AT_RECURSIVE if recursive else 0,
-        ctypes.byref(restrictions),
-        ctypes.c_size_t(ctypes.sizeof(restrictions)),
-    )
-    _checked(result, f"restricting {target}")
+    flags = _AT_RECURSIVE if recursive else 0
+    size = ctypes.c_size_t(ctypes.sizeof(restrictions))
+    path, order = os.fsencode(target), ctypes.byref(restrictions)
+    _system_call(f"restricting {target}", "mount_setattr", _AT_FDCWD, path, flags, order, size)
 
 
 def unmount(target: str) -> None:
@@ -221,32 +174,28 @@ def unmount(target: str) -> None:
 
 def pivot_root(new: str, old: str) -> None:
     """Make `new` the root; the old one appears at `old` (pivot_root(2))."""
-    libc = _libc()
-    number = {"x86_64": 155, "aarch64": 41, "riscv64": 41}.get(os.uname().machine)
-    if number is None:
-        raise Refused(errno.ENOSYS, f"pivot_root: not known on {os.uname().machine}")
-    _checked(libc.syscall(number, os.fsencode(new), os.fsencode(old)), "pivot_root")
+    _system_call("pivot_root", "pivot_root", os.fsencode(new), os.fsencode(old))
 
 
 def die_with_parent(signal_number: int) -> None:
     """Have this process sent a signal when its parent's thread ends."""
-    _checked(_libc().prctl(_PR_SET_PDEATHSIG, signal_number, 0, 0, 0), "parent death signal")
+    _prctl(_PR_SET_PDEATHSIG, signal_number, "parent death signal")
 
 
 def adopt_orphans() -> None:
     """Become the parent of every descendant whose own parent ends."""
-    _checked(_libc().prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0), "subreaper")
+    _prctl(_PR_SET_CHILD_SUBREAPER, 1, "subreaper")
 
 
 def hide_from_peers() -> None:
     """Close this process's memory and descriptors to others of the same user."""
-    _checked(_libc().prctl(PR_SET_DUMPABLE, 0, 0, 0, 0), "dumpable")
+    _prctl(PR_SET_DUMPABLE, 0, "dumpable")
 
 
 def give_up_privileges() -> None:
     """Drop every capability for good, and with it the right to undo the mounts."""
     libc = _libc()
-    _checked(libc.prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0), "no new privileges")
+    _prctl(_PR_SET_NO_NEW_PRIVS, 1, "no new privileges")
     for capability in range(64):
         if libc.prctl(_PR_CAPBSET_DROP, capability, 0, 0, 0) == -1:
             if ctypes.get_errno() == errno.EINVAL:  # beyond the last one that this kernel has
@@ -259,33 +208,18 @@ def give_up_privileges() -> None:
 
 def leave_session_keyring() -> None:
     """Take a new, empty session keyring in place of the caller's (keyctl(2))."""
-    number = _SYS_KEYCTL.get(os.uname().machine)
-    if number is not None:
-        joined = _libc().syscall(number, _KEYCTL_JOIN_SESSION_KEYRING, None)
-        _checked(joined, "a new session keyring")
-
-
-def set_filter(program: bytes) -> None:
-    """Have the kernel run a filter on every system call from now on (seccomp(2))."""
-    if not program:
-        raise Refused(errno.ENOSYS, f"filter of system calls: not known on {os.uname().machine}")
-    order = _FilterProgram(len(program) // 8, program)
-    done = _libc().prctl(_PR_SET_SECCOMP, _SECCOMP_MODE_FILTER, ctypes.byref(order), 0, 0)
-    _checked(done, "filter of system calls")
+    _system_call("a new session keyring", "keyctl", _KEYCTL_JOIN_SESSION_KEYRING, None)
 
 
 # --- the filter of system calls
 
 
-@dataclass(frozen=True)
-class _Test:
+class _Test(NamedTuple):
     """A condition on one argument of a call, as far as its lower 32 bits."""
 
-    #: Which argument.
     argument: int
-    #: `_EQUAL` or `_ANY_BIT`.
+    #: `_EQUAL` or `_ANY_BIT`, and what the argument is compared with.
     operation: int
-    #: What it is compared with.
     value: int
 
 
@@ -294,7 +228,12 @@ def refuse_calls(*, memory_files: bool) -> None:
 
     It must not be able to gain privileges any more.
     """
-    set_filter(program_of(os.uname().machine, memory_files=memory_files))
+    program = program_of(os.uname().machine, memory_files=memory_files)
+    if not program:
+        raise Refused(errno.ENOSYS, f"filter of system calls: not known on {os.uname().machine}")
+    order = _FilterProgram(len(program) // 8, program)
+    done = _libc().prctl(_PR_SET_SECCOMP, _SECCOMP_MODE_FILTER, ctypes.byref(order), 0, 0)
+    _checked(done, "filter of system calls")
 
 
 def program_of(machine: str, *, memory_files: bool) -> bytes:
@@ -340,10 +279,8 @@ def _conditions() -> Iterable[tuple[str, tuple[_Test, ...], int]]:
     yield "prctl", (_Test(0, _EQUAL, PR_SET_DUMPABLE),), errno.EPERM
 
 
-def _conditional(
-    number: int, tests: tuple[_Test, ...], error: int
-) -> list[tuple[int, int, int, int]]:
-    code: list[tuple[int, int, int, int]] = []
+def _conditional(number: int, tests: tuple[_Test, ...], error: int) -> list[_Instruction]:
+    code: list[_Instruction] = []
     left = 2 * len(tests) + 1
     code.append((_EQUAL, 0, left + 1, number))
     for test in tests:
@@ -353,12 +290,12 @@ def _conditional(
     return [*code, _answer(error), (_RETURN, 0, 0, _ALLOW)]
 
 
-def _socket(number: int) -> list[tuple[int, int, int, int]]:
+def _socket(number: int) -> list[_Instruction]:
     count = len(_FAMILIES)
     code = [(_EQUAL, 0, count + 3, number), (_LOAD, 0, 0, _ARGUMENTS_AT)]
     code += [(_EQUAL, count - place, 0, family) for place, family in enumerate(_FAMILIES)]
     return [*code, _answer(errno.EAFNOSUPPORT), (_RETURN, 0, 0, _ALLOW)]
 
 
-def _answer(number: int) -> tuple[int, int, int, int]:
+def _answer(number: int) -> _Instruction:
     return (_RETURN, 0, 0, _ERROR | number)

@@ -294,13 +294,9 @@ PIXELS = SIZE * SIZE * 4
 
 
 def read_and_score(capture: Capture) -> None:
-    def read(frame: int) -> Frame:
+    for frame in range(len(capture)):
         image = capture.frame(frame)
-        return Frame(image, image, capture.mask(frame))
-
-    frames = [partial(read, frame) for frame in range(len(capture))]
-    for _ in score_frames(frames, workers=1):
-        pass
+        score_frames([Frame(image, image, capture.mask(frame))])
 
 
 def peak(work: Callable[[], object]) -> int:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from small_captures import CaptureMaker
+from small_methods import SUBMISSION, write_manifest
 
 from hwp_bench.base.errors import BadCapture, BadInput, UsageError
 from hwp_bench.base.files import canonical_json
@@ -151,9 +152,7 @@ def test_submissions_are_scored_against_the_sealed_part(
         for frame in (18, 19):
             pixels = capture.frame(frame) // 2
             write_image(entry / "predictions" / capture.info.id / f"{frame:06d}.png", pixels)
-    (entry / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "half"\n[entry]\npredictions = "predictions"\n'
-    )
+    write_manifest(entry, "half", SUBMISSION)
     words = ["evaluate", str(entry), "--json", "--out"]
     assert main([*words, str(tmp_path / "s"), "--sealed", str(publication.sealed)]) == 0
     shown = capsys.readouterr()

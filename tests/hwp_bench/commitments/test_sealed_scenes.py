@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import hmac
 import json
+import secrets
 from dataclasses import asdict
 from typing import Any
 
@@ -19,7 +20,6 @@ from hwp_bench.commitments.recipe import (
     RecipeScene,
     derived,
     derived_seed,
-    draw_secret,
     read_secret,
     recipe_of,
     sealed_scene,
@@ -76,7 +76,7 @@ def test_the_commitment_is_a_digest_of_secret_and_recipe(secret: str) -> None:
     found = secret_commitment(secret, recipe)
     assert found == hashlib.sha256(text.encode()).hexdigest()
     assert found != secret_commitment(secret, {**recipe, "size": 65})
-    assert found != secret_commitment(draw_secret(), recipe)
+    assert found != secret_commitment(secrets.token_hex(32), recipe)
 
 
 @pytest.mark.parametrize("name", known_scenes())

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from small_captures import CaptureMaker
+from small_methods import SUBMISSION, write_manifest
 
 from hwp_bench.base.errors import BadCapture, BadImage, BadSplit, UsageError
 from hwp_bench.base.images import write_image
@@ -16,7 +17,7 @@ from hwp_bench.capture import Capture
 from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.evaluation.evaluate import EvaluationSettings, default_folder, evaluate
 from hwp_bench.methods.contract import Budget, RunSettings
-from hwp_bench.metrics import METRICS, PROTOCOLS, metric, penalty
+from hwp_bench.metrics import METRICS, metric, penalty
 from hwp_bench.results import Results, read_results
 from hwp_bench.run.sandbox.confinement import Confinement
 
@@ -30,9 +31,7 @@ def submission(folder: Path, captures: list[Capture], pixels=Capture.frame) -> P
         target = folder / "predictions" / capture.info.id
         for frame in contiguous_split(capture.info.id, len(capture)).test.tolist():
             write_image(target / f"{frame:06d}.png", pixels(capture, frame))
-    (folder / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "entry"\n[entry]\npredictions = "predictions"\n'
-    )
+    write_manifest(folder, "entry", SUBMISSION)
     return folder
 
 
@@ -87,13 +86,21 @@ def noisy(capture: Capture, frame: int) -> np.ndarray:
     return np.clip(capture.frame(frame) + rng.normal(0, 20, (48, 48, 3)), 0, 255).astype(np.uint8)
 
 
-def test_order_extra_files_and_masks_in_a_submission_change_nothing(captures, tmp_path) -> None:
+def test_what_does_not_count_changes_nothing(captures, tmp_path: Path) -> None:
+    """Order, further files, an alpha channel, and pixels outside of the mask."""
     plain = run(submission(tmp_path / "a", captures, noisy), captures, tmp_path / "out-a")
-    entry = submission(tmp_path / "b", captures, noisy)
+
+    def painted(capture: Capture, frame: int) -> np.ndarray:
+        mask, _ = capture.scoring_mask(frame)
+        pixels = np.where(mask[:, :, None] > 127, noisy(capture, frame), 255)
+        return np.dstack([pixels, np.zeros((48, 48, 1))]).astype(np.uint8)
+
+    other = run(submission(tmp_path / "b", captures, painted), captures, tmp_path / "out-b")
+    assert scores(other) == scores(plain)
+    entry = submission(tmp_path / "c", captures, noisy)
     folder = entry / "predictions" / "single"
     # Written again in the opposite order, with masks, other frames and files next to them.
-    files = sorted(folder.iterdir(), reverse=True)
-    contents = [(path, path.read_bytes()) for path in files]
+    contents = [(path, path.read_bytes()) for path in sorted(folder.iterdir(), reverse=True)]
     shutil.rmtree(folder)
     (folder / "masks").mkdir(parents=True)
     for path, content in contents:
@@ -103,68 +110,38 @@ def test_order_extra_files_and_masks_in_a_submission_change_nothing(captures, tm
     write_image(folder / "000001.png", np.zeros((48, 48, 3), np.uint8))
     (folder / "notes.txt").write_text("hello")
     (entry / "masks").mkdir()
-    other = run(entry, captures, tmp_path / "out-b")
+    other = run(entry, captures, tmp_path / "out-c")
     assert scores(other) == scores(plain)
     assert other.captures[0].predictions_digest == plain.captures[0].predictions_digest
 
 
-def test_an_alpha_channel_does_not_act_as_a_mask(captures, tmp_path: Path) -> None:
-    plain = run(submission(tmp_path / "a", captures, noisy), captures, tmp_path / "out-a")
-
-    def transparent(capture: Capture, frame: int) -> np.ndarray:
-        alpha = np.zeros((48, 48, 1), np.uint8)
-        return np.concatenate([noisy(capture, frame), alpha], axis=2)
-
-    other = run(submission(tmp_path / "b", captures, transparent), captures, tmp_path / "out-b")
-    assert scores(other) == scores(plain)
-
-
-def test_pixels_outside_the_mask_do_not_count(captures, tmp_path: Path) -> None:
-    def painted(capture: Capture, frame: int) -> np.ndarray:
-        mask, _ = capture.scoring_mask(frame)
-        return np.where(mask[:, :, None] > 127, noisy(capture, frame), 255).astype(np.uint8)
-
-    plain = run(submission(tmp_path / "a", captures, noisy), captures, tmp_path / "out-a")
-    other = run(submission(tmp_path / "b", captures, painted), captures, tmp_path / "out-b")
-    assert scores(other) == scores(plain)
-
-
-@pytest.mark.parametrize(
-    ("damage", "problem"),
-    [
-        (lambda path: path.unlink(), "000018.png: does not exist"),
-        (lambda path: path.write_bytes(b""), "000018.png: is empty"),
-        (lambda path: path.write_bytes(path.read_bytes()[:200]), "is damaged or truncated"),
-        (
-            lambda path: write_image(path, np.zeros((47, 48, 3), np.uint8)),
-            "is 48x47 pixels where 48x48",
+def test_a_frame_that_cannot_be_scored_is_named_and_penalised(captures, tmp_path: Path) -> None:
+    entry = submission(tmp_path / "entry", captures)
+    damages = {
+        "000018.png: does not exist": Path.unlink,
+        "000018.png: is empty": lambda path: path.write_bytes(b""),
+        "is 48x47 pixels where 48x48": lambda path: write_image(
+            path, np.zeros((47, 48, 3), np.uint8)
         ),
-    ],
-)
-def test_a_frame_that_cannot_be_scored_is_named_and_penalised(
-    captures, tmp_path: Path, damage, problem: str
-) -> None:
-    entry = submission(tmp_path / "entry", captures)
-    damage(entry / "predictions" / "single" / "000018.png")
-    results = run(entry, captures, tmp_path / "out")
-    bad, good = results.captures[0].frames
-    assert problem in bad.failure
-    assert bad.scores == {name: penalty(PROTOCOLS)[name] for name in bad.scores}
-    assert good.failure is None
-    assert good.scores["psnr"] == metric("psnr").perfect
-    assert results.captures[0].failed_frames == 1
-
-
-def test_a_capture_without_predictions_fails_by_name_and_the_rest_is_scored(
-    captures, tmp_path: Path
-) -> None:
-    entry = submission(tmp_path / "entry", captures)
+        "is damaged or truncated": lambda path: path.write_bytes(path.read_bytes()[:200]),
+    }
+    picture = entry / "predictions" / "single" / "000018.png"
+    for number, (problem, damage) in enumerate(damages.items()):
+        picture.unlink(missing_ok=True)
+        write_image(picture, captures[0].frame(18))
+        damage(picture)
+        results = run(entry, captures, tmp_path / f"out-{number}")
+        bad, good = results.captures[0].frames
+        assert problem in bad.failure
+        assert bad.scores == {name: penalty()[name] for name in bad.scores}
+        assert good.failure is None
+        assert good.scores["psnr"] == metric("psnr").perfect
+        assert results.captures[0].failed_frames == 1
+    # A capture without predictions fails by name, and the rest is scored.
     shutil.rmtree(entry / "predictions" / "single")
     results = run(entry, captures, tmp_path / "out")
     assert "has no predictions for single" in results.captures[0].failure
-    assert results.captures[0].failed_frames == 2
-    assert results.captures[1].failure is None
-    assert results.captures[1].failed_frames == 0
+    assert [capture.failed_frames for capture in results.captures] == [2, 0]
 
 
 def counting_method(folder: Path, body: str = "") -> Path:

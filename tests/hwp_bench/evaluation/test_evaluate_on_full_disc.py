@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 from small_captures import CaptureMaker
+from small_methods import SCRIPT, write_manifest
 
 _METHOD = """
 import json, os, pathlib, sys, time
@@ -84,10 +85,7 @@ def evaluated(make_capture: CaptureMaker, tmp_path: Path) -> Callable[..., dict[
             folder.mkdir()
         script = _METHOD.replace("PRINT", printed or "pass").replace("FILLER", f"{disc}/filler")
         (method / "run.py").write_text(script.replace("STAYS", "yes" if stays else "no"))
-        (method / "method.toml").write_text(
-            'schema = "hwp-method/1"\nname = "filler"\n[entry]\n'
-            'command = ["{python}", "{method}/run.py", "{request}", "{output}"]\n'
-        )
+        write_manifest(method, "filler", SCRIPT)
         captures = [make_capture(name, frames=20, size=32).root for name in ("first", "second")]
         walls = ["unshare", "--user", "--map-root-user", "--mount"]
         if subprocess.run([*walls, "true"], check=False, capture_output=True).returncode:

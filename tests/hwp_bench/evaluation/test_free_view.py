@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from small_captures import CaptureMaker
+from small_methods import SUBMISSION, write_manifest
 
 from hwp_bench.base.errors import BadCapture, BadInput
 from hwp_bench.base.images import read_rgb, write_image
@@ -24,7 +25,7 @@ from hwp_bench.evaluation.evaluate import EvaluationSettings, evaluate
 from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.manifest import read_manifest
 from hwp_bench.methods.request import open_request, write_request
-from hwp_bench.metrics import PROTOCOLS, metric, penalty
+from hwp_bench.metrics import metric, penalty
 from hwp_bench.results import CaptureResult, read_results
 from hwp_bench.run.sandbox.confinement import Confinement
 
@@ -58,9 +59,7 @@ def submission(folder: Path, capture: Capture, views: range | tuple[int, ...]) -
         write_image(target / f"{frame:06d}.png", capture.frame(frame))
     for frame in views:
         write_image(target / "free" / f"{frame:06d}.png", clip_of(capture).frame(frame))
-    (folder / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "entry"\n[entry]\npredictions = "predictions"\n'
-    )
+    write_manifest(folder, "entry", SUBMISSION)
     return folder
 
 
@@ -83,9 +82,7 @@ class Method:
         return pixels
 """
     )
-    (folder / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "grey"\n[entry]\npython = "free_method:Method"\n'
-    )
+    write_manifest(folder, "grey", 'python = "free_method:Method"')
     return folder
 
 
@@ -107,7 +104,7 @@ def test_the_truth_scores_perfectly_and_a_missing_frame_costs_its_penalty(
     for row in free.frames:
         if row.frame == 2:
             assert "does not exist" in (row.failure or "")
-            assert row.scores == penalty(PROTOCOLS, {})
+            assert row.scores == penalty()
             continue
         assert row.failure is None
         for name, value in row.scores.items():
@@ -170,14 +167,14 @@ def test_a_frame_that_fails_costs_itself_and_no_more(
     free = result.free_view
     assert free is not None
     assert [row.failure is None for row in free.frames] == [True] * 3 + [False] * 2
-    assert free.frames[4].scores == penalty(PROTOCOLS, {})
+    assert free.frames[4].scores == penalty()
 
 
 def test_a_method_that_crashes_gets_every_penalty(capture: Capture, tmp_path: Path) -> None:
     crashing = method(tmp_path / "m", fit="raise RuntimeError('no luck')")
     free = run(crashing, capture, tmp_path / "out").free_view
     assert free is not None
-    assert all(row.scores == penalty(PROTOCOLS, {}) for row in free.frames)
+    assert all(row.scores == penalty() for row in free.frames)
 
 
 def test_a_request_has_hands_and_cameras_but_no_picture(capture: Capture, tmp_path: Path) -> None:
@@ -269,23 +266,21 @@ def _edit(out: Path, change: Callable[[dict], object]) -> None:
     file.write_text(json.dumps(value))
 
 
-@pytest.mark.parametrize(
-    ("change", "what"),
-    [
-        (lambda free: free["frames"][1]["scores"].update(psnr=1.0), "frame 1, psnr"),
-        (lambda free: free.update(digest="0" * 64), "capture"),
-        (lambda free: free.update(predictions_digest="0" * 64), "predictions"),
-        (lambda free: free["frames"].pop(), "frames"),
-    ],
-)
-def test_an_edited_number_is_found_out(
-    evaluated: Path, capture: Capture, capsys, change: Callable[[dict], object], what: str
-) -> None:
-    _edit(evaluated, lambda value: change(value["free_view"]))
-    status, found = verify(evaluated, capture, capsys)
-    assert status == 1
-    names = {(item["capture"], item["what"]) for item in found["discrepancies"]}
-    assert ("tiny, free view", what) in names
+def test_an_edited_number_is_found_out(evaluated: Path, capture: Capture, capsys) -> None:
+    before = (evaluated / "results.json").read_bytes()
+    changes: dict[str, Callable[[dict], object]] = {
+        "frame 1, psnr": lambda free: free["frames"][1]["scores"].update(psnr=1.0),
+        "capture": lambda free: free.update(digest="0" * 64),
+        "predictions": lambda free: free.update(predictions_digest="0" * 64),
+        "frames": lambda free: free["frames"].pop(),
+    }
+    for what, change in changes.items():
+        (evaluated / "results.json").write_bytes(before)
+        _edit(evaluated, lambda value, change=change: change(value["free_view"]))
+        status, found = verify(evaluated, capture, capsys)
+        assert status == 1
+        names = {(item["capture"], item["what"]) for item in found["discrepancies"]}
+        assert ("tiny, free view", what) in names
 
 
 def test_edited_pictures_are_found_out(evaluated: Path, capture: Capture, capsys) -> None:
@@ -333,15 +328,10 @@ def test_a_clip_without_a_hand_is_named_before_the_method_runs(
 
 
 def test_a_clip_whose_scores_were_taken_out_is_found_out(
-    capture: Capture, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    evaluated: Path, capture: Capture, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Oracle: the predictions of the clip that are still there."""
-    out = tmp_path / "out"
-    run(submission(tmp_path / "entry", capture, range(VIEWS)), capture, out)
-    given = ["verify", str(out), "--captures", str(capture.root)]
-    assert main(given) == 0
-    value = json.loads((out / "results.json").read_text())
-    value["captures"][0]["free_view"] = None
-    (out / "results.json").write_text(json.dumps(value))
-    assert main(given) == 1
-    assert "tiny, free view" in capsys.readouterr().out
+    _edit(evaluated, lambda value: value.update(free_view=None))
+    status, found = verify(evaluated, capture, capsys)
+    assert status == 1
+    assert "tiny, free view" in {item["capture"] for item in found["discrepancies"]}

@@ -19,7 +19,7 @@ MANIFEST = """
 schema = "hwp-method/1"
 name = "mine"
 [entry]
-{entry}
+ENTRY
 [presets.default]
 level = 0.5
 [presets.default.light]
@@ -43,38 +43,37 @@ def no_rendering(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
 
 
-def _method(folder: Path, entry: str = 'python = "mine:Method"', code: str = METHOD) -> Path:
+def _method(
+    folder: Path, entry: str = 'python = "mine:Method"', code: str = METHOD, more: str = ""
+) -> Path:
     folder.mkdir()
     (folder / "mine.py").write_text(code)
-    (folder / "method.toml").write_text(MANIFEST.format(entry=entry))
+    (folder / "method.toml").write_text(MANIFEST.replace("ENTRY", entry) + more)
     return folder
 
 
-@pytest.mark.parametrize("command", ["evaluate", "ablate", "budget"])
-@pytest.mark.parametrize(
-    ("words", "status", "problem"),
-    [
-        (["--set", "levl=1"], 1, "Did you mean 'level'?"),
-        (["--set", "light.degre=1"], 1, "Did you mean 'light.degree'?"),
-        (["--preset", "fast"], 1, "has no preset 'fast'"),
-        (["--expose", "nowhere"], 2, "nowhere: --expose: does not exist"),
-        (["--out", "mine/mine.py"], 2, "--out: lies in the input METHOD"),
-        (["--out", "file"], 1, "cannot be a results folder"),
-        (["--out", "file/deeper"], 1, "cannot be a results folder"),
-        (["--splits", "nowhere.json"], 1, "nowhere.json: does not exist"),
-        (["--engine", "rai"], 2, "is not an engine"),
-        (["--set", "level=bright"], 1, "mine cannot be made: ValueError: could not convert"),
-    ],
+WRONG = (
+    (["--set", "levl=1"], 1, "Did you mean 'level'?"),
+    (["--set", "light.degre=1"], 1, "Did you mean 'light.degree'?"),
+    (["--preset", "fast"], 1, "has no preset 'fast'"),
+    (["--expose", "nowhere"], 2, "nowhere: --expose: does not exist"),
+    (["--out", "mine/mine.py"], 2, "--out: lies in the input METHOD"),
+    (["--out", "file"], 1, "cannot be a results folder"),
+    (["--out", "file/deeper"], 1, "cannot be a results folder"),
+    (["--splits", "nowhere.json"], 1, "nowhere.json: does not exist"),
+    (["--engine", "rai"], 2, "is not an engine"),
+    (["--set", "level=bright"], 1, "mine cannot be made: ValueError: could not convert"),
 )
-def test_a_wrong_call_renders_nothing(
-    command: str, words: list[str], status: int, problem: str, tmp_path: Path, capsys
-) -> None:
-    _method(tmp_path / "mine")
+SWITCH = "[switches.a]\nsettings_off = {level = 0.1}\n"
+
+
+@pytest.mark.parametrize("command", ["evaluate", "ablate", "budget"])
+def test_a_wrong_call_renders_nothing(command: str, tmp_path: Path, capsys) -> None:
+    _method(tmp_path / "mine", more=SWITCH)
     (tmp_path / "file").write_text("mine")
-    with open(tmp_path / "mine" / "method.toml", "a") as stream:
-        stream.write("[switches.a]\nsettings_off = {level = 0.1}\n")
-    assert main([command, "mine", "--suite", "smoke", *words]) == status
-    assert problem in capsys.readouterr().err
+    for words, status, problem in WRONG:
+        assert main([command, "mine", "--suite", "smoke", *words]) == status
+        assert problem in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -89,7 +88,7 @@ def test_a_wrong_call_renders_nothing(
 def test_a_method_that_cannot_start_renders_nothing(
     entry: str, code: str, problem: str, tmp_path: Path, capsys
 ) -> None:
-    _method(tmp_path / "mine", entry.replace("{request}", "{{request}}"), code)
+    _method(tmp_path / "mine", entry, code)
     assert main(["evaluate", "mine", "--suite", "smoke"]) == 1
     assert problem in capsys.readouterr().err
 
@@ -98,9 +97,7 @@ def test_a_method_that_cannot_start_renders_nothing(
 def test_a_method_that_cannot_be_made_is_said_once_before_the_first_capture(
     command: str, make_capture: CaptureMaker, tmp_path: Path, capsys
 ) -> None:
-    _method(tmp_path / "mine")
-    with open(tmp_path / "mine" / "method.toml", "a") as stream:
-        stream.write("[switches.a]\nsettings_off = {level = 0.1}\n")
+    _method(tmp_path / "mine", more=SWITCH)
     captures = [make_capture(name).root for name in ("first", "second")]
     words = [command, "mine", "--set", "level=bright", "--out", "out", "--capture"]
     assert main([*words, *map(str, captures)]) == 1
@@ -125,9 +122,7 @@ def test_nothing_drawn_is_no_table(make_capture: CaptureMaker, tmp_path: Path, c
 def test_a_program_that_may_not_be_run_is_said_before_the_first_capture(
     make_capture: CaptureMaker, tmp_path: Path, capsys
 ) -> None:
-    mine = _method(
-        tmp_path / "mine", 'command = ["{{method}}/run.sh"]'.replace("{{", "{").replace("}}", "}")
-    )
+    mine = _method(tmp_path / "mine", 'command = ["{method}/run.sh"]')
     words = ["evaluate", "mine", "--capture", str(make_capture("first").root)]
     assert main(words) == 1
     assert "there is no program '{method}/run.sh'" in capsys.readouterr().err

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import pytest
 from small_captures import CaptureMaker
+from small_methods import SCRIPT, write_manifest
 
 from benchmarks.patience import Patience, spent_by
 from hwp_bench.base.errors import BadMethod, UsageError
@@ -57,10 +58,7 @@ def method(tmp_path: Path) -> Path:
     folder = tmp_path / "gray"
     folder.mkdir()
     (folder / "run.py").write_text(_SCRIPT)
-    (folder / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "gray"\n[entry]\n'
-        'command = ["{python}", "{method}/run.py", "{request}", "{output}"]\n'
-    )
+    write_manifest(folder, "gray", SCRIPT)
     return folder
 
 

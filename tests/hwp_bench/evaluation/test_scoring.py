@@ -19,6 +19,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from small_captures import CaptureMaker, hand_picture
+from small_methods import SUBMISSION, write_manifest
 
 from hwp_bench.base.files import sha256_json
 from hwp_bench.base.images import as_uint8, write_image
@@ -91,9 +92,7 @@ def test_evaluate_warns_and_leaves_the_score_alone(
     for frame in (18, 19):
         pixels = np.ascontiguousarray(capture.frame(frame)[:, :, ::-1])
         write_image(entry / "predictions" / "tiny" / f"{frame:06d}.png", pixels)
-    (entry / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "bgr"\n[entry]\npredictions = "predictions"\n'
-    )
+    write_manifest(entry, "bgr", SUBMISSION)
     words = ["evaluate", str(entry), "--capture", str(capture.root), "--out", str(out)]
     assert main(words) == 0
     captured = capsys.readouterr()
@@ -117,9 +116,7 @@ def submission(folder: Path, name: str, capture: Capture) -> Path:
     for frame in (18, 19):
         pixels = capture.frame(frame) // 2
         write_image(folder / "predictions" / "clip" / f"{frame:06d}.png", pixels)
-    (folder / "method.toml").write_text(
-        f'schema = "hwp-method/1"\nname = "{name}"\n[entry]\npredictions = "predictions"\n'
-    )
+    write_manifest(folder, name, SUBMISSION)
     return folder
 
 

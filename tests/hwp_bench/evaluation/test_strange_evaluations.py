@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from small_captures import CaptureMaker
+from small_methods import SCRIPT, write_manifest
 
 from hwp_bench.base.images import write_image
 from hwp_bench.capture import Capture
@@ -41,10 +42,7 @@ def claiming(folder: Path, facts: str, more: str = "") -> Path:
     folder.mkdir(exist_ok=True)
     (folder / "run.py").write_text(_SCRIPT)
     (folder / "facts.json").write_text(facts)
-    (folder / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "claim"\n[entry]\n'
-        'command = ["{python}", "{method}/run.py", "{request}", "{output}"]\n' + more
-    )
+    write_manifest(folder, "claim", SCRIPT, more)
     return folder
 
 

@@ -20,7 +20,7 @@ from hwp_bench.capture.schema import frame_name
 from hwp_bench.cli.main import main
 from hwp_bench.evaluation.scoring import predictions_digest, read_predictions
 from hwp_bench.leaderboard.entries import digest, make_entry, read_entries, write_entry
-from hwp_bench.leaderboard.submit import confirm
+from hwp_bench.leaderboard.submit import confirm, entry_of
 from hwp_bench.results import read_results, write_results
 from hwp_bench.sim.produce.suites import suite
 
@@ -215,11 +215,11 @@ def test_a_second_run_reproduces_within_the_tolerance(made) -> None:
     before = "2020-01-01T00:00:00+00:00"
     for shift, verdict in ((0.0, "reproduces"), (0.09, "reproduces"), (-0.11, "differs")):
         entry = make_entry(moved(again, psnr=shift, started=before))
-        check = confirm([entry], file, [capture], by="us")
+        check = confirm(entry, file, [capture], by="us")
         assert (check.kind, check.verdict, check.same_predictions) == ("re-run", verdict, 1)
         assert check.scores["psnr"] == pytest.approx(again.scores["psnr"])
         assert (check.rerun, check.tolerance) == (digest(again), 0.1)
-    assert confirm([entry], file, [capture], by="us", tolerance=0.2).verdict == "reproduces"
+    assert confirm(entry, file, [capture], by="us", tolerance=0.2).verdict == "reproduces"
 
 
 def test_a_second_run_must_hold_itself_and_be_of_the_entry(made) -> None:
@@ -228,7 +228,7 @@ def test_a_second_run_must_hold_itself_and_be_of_the_entry(made) -> None:
     entry = make_entry(replace(again, started="2020-01-01T00:00:00+00:00"))
     write_results(file, moved(again, psnr=0.01))
     with pytest.raises(BadResult, match="is not as it says"):
-        confirm([entry], file, [capture], by="us")
+        confirm(entry, file, [capture], by="us")
     write_results(file, again)
     for changes in (
         {"seed": 5},
@@ -237,10 +237,8 @@ def test_a_second_run_must_hold_itself_and_be_of_the_entry(made) -> None:
         {"captures": [replace(again.captures[0], digest="other")]},
     ):
         with pytest.raises(UsageError, match="no entry is of this result or run"):
-            confirm([make_entry(replace(entry.results, **changes))], file, [capture], by="us")
+            entry_of([make_entry(replace(entry.results, **changes))], again, None)
     twin = make_entry(replace(entry.results, started="2021-01-01T00:00:00+00:00"))
     with pytest.raises(UsageError, match="several entries fit"):
-        confirm([entry, twin], file, [capture], by="us")
-    assert confirm([entry, twin], file, [capture], by="us", name=twin.name).entry == twin.name
-    with pytest.raises(UsageError, match="not between 0 and 100"):
-        confirm([entry], file, [capture], by="us", tolerance=-1.0)
+        entry_of([entry, twin], again, None)
+    assert entry_of([entry, twin], again, twin.name) is twin

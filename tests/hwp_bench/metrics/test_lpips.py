@@ -15,14 +15,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hwp_bench.base.errors import BadInput, MissingDependency, ShapeMismatch, UsageError
+from hwp_bench.base.errors import BadInput, MissingDependency, ShapeMismatch
 from hwp_bench.metrics import lpips as lpips_weights
 from hwp_bench.metrics.lpips import (
     BACKBONE_FILES,
     LINEAR_DIGESTS,
     Lpips,
-    LpipsFiles,
-    find_weights,
     load_available,
     load_lpips,
     lpips_available,
@@ -212,18 +210,23 @@ def small_states() -> tuple[dict, dict]:
 
 
 @pytest.fixture
-def installed(hub: Path, monkeypatch: pytest.MonkeyPatch) -> LpipsFiles:
-    """Made-up weights that are declared to be the published ones."""
+def installed(hub: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]:
+    """Made-up weights, backbone and linear layers, that are declared to be the published ones."""
     backbone, linear = small_states()
-    draft, linear_path = hub / "draft", hub / "alex-linear.pth"
+    draft, package = hub / "draft", hub.parent / "layers"
+    (package / "v").mkdir(parents=True)
+    (package / "__init__.py").touch()
+    linear_path = package / "v" / "alex.pth"
     torch.save(backbone, draft)
     torch.save(linear, linear_path)
     digest = hashlib.sha256(draft.read_bytes()).hexdigest()
     path = draft.rename(hub / f"alexnet-owt-{digest[:8]}.pth")
+    monkeypatch.syspath_prepend(hub.parent)
+    monkeypatch.setattr(lpips_weights, "LINEAR_PACKAGES", (("layers", "v"),))
     monkeypatch.setattr(lpips_weights, "BACKBONE_FILES", {"alex": (path.name,)})
     linear_digest = hashlib.sha256(linear_path.read_bytes()).hexdigest()
     monkeypatch.setattr(lpips_weights, "LINEAR_DIGESTS", {"alex": linear_digest})
-    return LpipsFiles(backbone=path, linear=linear_path)
+    return path, linear_path
 
 
 def test_absent_weights_are_a_reason_and_never_an_entry(hub: Path):
@@ -236,35 +239,25 @@ def test_absent_weights_are_a_reason_and_never_an_entry(hub: Path):
     assert load_available() == {}
 
 
-def test_an_absent_linear_file_is_a_reason_too(installed: LpipsFiles, tmp_path: Path):
-    reason = lpips_available("alex")
-    assert reason is not None
-    assert "linear layers" in reason
-    gone = LpipsFiles(installed.backbone, tmp_path / "gone.pth")
-    assert "gone.pth" in (lpips_available("alex", gone) or "")
-
-
-def test_weights_by_path_and_in_the_hub_cache_are_loaded(installed: LpipsFiles):
-    assert lpips_available("alex", installed) is None
+def test_weights_are_found_and_an_absent_file_is_a_reason(installed: tuple[Path, Path]):
     images = np.random.default_rng(0).random((2, 64, 64, 3))
-    by_path = load_lpips("alex", installed)(*images)
-    from_cache = load_lpips("alex", LpipsFiles(linear=installed.linear))(*images)
-    assert by_path == from_cache > 0.0
+    assert load_available()["alex"](*images) > 0.0
+    installed[1].unlink()
+    assert "linear layers" in (lpips_available("alex") or "")
 
 
 def test_the_cache_is_where_torch_says(hub: Path, monkeypatch: pytest.MonkeyPatch):
     """Oracle: torch.hub.get_dir()."""
-    assert lpips_weights._hub_checkpoints() == Path(torch.hub.get_dir()) / "checkpoints"
+    assert lpips_weights.torch_home() / "hub" == Path(torch.hub.get_dir())
     monkeypatch.delenv("TORCH_HOME")
     monkeypatch.setenv("XDG_CACHE_HOME", "/somewhere")
-    assert lpips_weights._hub_checkpoints() == Path(torch.hub.get_dir()) / "checkpoints"
+    assert lpips_weights.torch_home() / "hub" == Path(torch.hub.get_dir())
 
 
-def test_a_file_that_is_not_the_published_one_is_refused(hub: Path, installed: LpipsFiles):
-    assert installed.backbone is not None
-    installed.backbone.write_bytes(installed.backbone.read_bytes() + b"x")
+def test_a_file_that_is_not_the_published_one_is_refused(installed: tuple[Path, Path]):
+    installed[0].write_bytes(installed[0].read_bytes() + b"x")
     with pytest.raises(BadInput, match="not the published checkpoint"):
-        load_lpips("alex", installed)
+        load_lpips("alex")
 
 
 class Foreign:
@@ -280,14 +273,13 @@ class Foreign:
     ids=["foreign class", "empty", "truncated", "no dictionary"],
 )
 def test_a_foreign_or_damaged_file_runs_nothing(
-    content: bytes, installed: LpipsFiles, monkeypatch: pytest.MonkeyPatch, capsys
+    content: bytes, installed: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, capsys
 ):
-    assert installed.linear is not None
-    installed.linear.write_bytes(content)
+    installed[1].write_bytes(content)
     digest = hashlib.sha256(content).hexdigest()
     monkeypatch.setattr(lpips_weights, "LINEAR_DIGESTS", {"alex": digest})
-    with pytest.raises(BadInput, match=r"alex-linear\.pth"):
-        load_lpips("alex", installed)
+    with pytest.raises(BadInput, match=r"alex\.pth"):
+        load_lpips("alex")
     assert "run" not in capsys.readouterr().out
 
 
@@ -298,15 +290,10 @@ def test_the_linear_layers_of_packages_are_the_published_ones(source, net, monke
     if importlib.util.find_spec(source[0]) is None:
         pytest.skip(f"{source[0]} is not installed")
     monkeypatch.setattr(lpips_weights, "LINEAR_PACKAGES", (source,))
-    path = lpips_weights._find_linear(net, None)
+    path = lpips_weights._find_linear(net)
     assert hashlib.sha256(path.read_bytes()).hexdigest() == LINEAR_DIGESTS[net]
     state = lpips_weights._read_state(path, [LINEAR_DIGESTS[net]])
     assert all(float(weight.min()) >= 0 for weight in state.values())
-
-
-def test_an_unknown_network_is_refused():
-    with pytest.raises(UsageError, match="alex and vgg"):
-        find_weights("squeeze")
 
 
 def test_asking_does_not_import_torch():

@@ -17,7 +17,6 @@ from hwp_bench.metrics import (
     metric,
     metric_names,
     penalty,
-    protocol,
 )
 
 
@@ -46,7 +45,7 @@ def test_lpips_metrics_are_listed_only_with_their_network():
         "lpips_alex",
         "paper_lpips",
     }
-    assert set(metric_names((HWP_V1,), ["alex", "vgg"])) >= {"lpips_alex", "lpips_vgg"}
+    assert set(metric_names(["alex", "vgg"])) >= {"lpips_alex", "lpips_vgg"}
 
 
 def test_declared_penalties():
@@ -68,9 +67,6 @@ def test_settings_that_give_the_protocols_their_names():
 def test_unknown_names_are_answered_with_the_nearest():
     with pytest.raises(UsageError, match="Did you mean 'ssim_full'"):
         metric("ssim_ful")
-    with pytest.raises(UsageError, match="Did you mean 'hwp-v1'"):
-        protocol("hwp_v1")
-    assert protocol("paper-wildghand") is PAPER_WILDGHAND
     assert metric("psnr").unit == "dB"
 
 

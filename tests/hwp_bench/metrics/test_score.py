@@ -125,7 +125,9 @@ def test_float_images_score_as_the_eight_bits_that_they_become(seed):
     prediction, target, mask = random_frame(seed)
     expected = score_frame(prediction, target, mask)
     assert score_frame(prediction / 255.0, target / 255.0, mask) == expected
-    assert score_frame((prediction / 255.0).astype(np.float32), target, mask) == expected
+    # A half between two 8-bit levels is off by 2^-12 at most, an eighth of a level: nothing moves.
+    for kind in (np.float32, np.float16):
+        assert score_frame((prediction / 255.0).astype(kind), target, mask) == expected
     # A rendering that overshoots is clipped, as it is when it is written.
     bright = np.where(prediction == 255, 1.3, prediction / 255.0)
     assert score_frame(bright, target, mask) == expected
@@ -233,15 +235,6 @@ def test_the_textured_disc_shows_why_conventions_matter():
     assert full_gaussian - hand_gaussian > 0.2
 
 
-def test_one_protocol_gives_its_own_metrics_only():
-    prediction, target, mask = random_frame(0)
-    both = score_frame(prediction, target, mask)
-    for chosen in (HWP_V1, PAPER_WILDGHAND):
-        scores = score_frame(prediction, target, mask, (chosen,))
-        assert set(scores) == set(metric_names((chosen,)))
-        assert scores == {name: both[name] for name in scores}
-
-
 def test_networks_see_the_black_box_in_range_and_at_least_64_pixels():
     prediction, target, mask = random_frame(7)
     seen = []
@@ -267,7 +260,6 @@ def test_an_empty_region_is_the_same_error_for_every_prediction():
     for prediction in (target, target[1:]):
         with pytest.raises(EmptyMask):
             score_frame(prediction, target, thin)
-    assert score_frame(target, target, thin, (PAPER_WILDGHAND,))["paper_ssim"] == 1.0
 
 
 def test_what_does_not_fit_is_refused_by_name():
@@ -286,6 +278,11 @@ def test_what_does_not_fit_is_refused_by_name():
         score_frame(prediction, target.astype(np.int16), mask)
     with pytest.raises(BadImage, match=r"target: .*divide"):
         score_frame(prediction, target.astype(np.float64), mask)
+    for dtype in (np.int32, np.complex64, bool):
+        with pytest.raises(HwpError):
+            score_frame(prediction, target.astype(dtype), mask)
+    with pytest.raises(BadImage):
+        score_frame(prediction, np.full(target.shape, np.nan, np.float16), mask)
     small = np.zeros((10, 10, 3), np.uint8)
     with pytest.raises(ShapeMismatch, match="window"):
         score_frame(small, small, np.full((10, 10), 255, np.uint8))
@@ -307,15 +304,9 @@ def frames(count: int) -> list[Frame]:
 def test_order_and_scores_do_not_depend_on_the_workers(workers):
     listed = frames(30)
     expected = [score_frame(f.prediction, f.target, f.mask) for f in listed]
-    got = list(score_frames(iter(listed), workers=workers))
+    got = score_frames(iter(listed), workers=workers)
     assert [score.values for score in got] == expected
-    assert not any(score.failure or score.empty for score in got)
-
-
-def test_frames_may_be_read_on_the_workers():
-    listed = frames(5)
-    lazy = [(lambda frame=frame: frame) for frame in listed]
-    assert list(score_frames(lazy, workers=2)) == list(score_frames(listed, workers=2))
+    assert not any(score.failure for score in got)
 
 
 def test_a_failed_prediction_costs_its_penalty_and_no_row():
@@ -324,14 +315,14 @@ def test_a_failed_prediction_costs_its_penalty_and_no_row():
     listed[1] = Frame(BadPrediction("does not exist", where="0001.png"), target, mask)
     listed[2] = Frame(target[:-1], target, mask)
     listed[3] = Frame(target / 255.0, target, mask)
-    got = list(score_frames(listed, (HWP_V1,), workers=2))
+    got = score_frames(listed, workers=2)
     assert len(got) == 5
     assert [score.failure is not None for score in got] == [False, True, True, True, False]
     assert "0001.png: does not exist" in got[1].failure
     assert "(39, 44, 3)" in got[2].failure
     assert "float64" in got[3].failure
     for score in got[1:4]:
-        assert score.values == penalty((HWP_V1,))
+        assert score.values == penalty()
 
 
 def test_a_failed_frame_gets_the_penalty_of_the_networks_too():
@@ -349,7 +340,7 @@ def test_a_frame_without_a_hand_is_empty_whatever_was_predicted(prediction):
     target = frames(1)[0].target
     given = target if prediction == "good" else BadPrediction("does not exist")
     (score,) = score_frames([Frame(given, target, np.zeros((40, 44), np.uint8))])
-    assert score.empty
+    assert score.values == {}
     assert score.failure is None
 
 
@@ -357,7 +348,7 @@ def test_a_fault_of_the_data_set_is_raised_not_penalised():
     good = frames(3)
     bad = Frame(good[0].prediction, good[0].target, good[0].mask[1:])
     with pytest.raises(ShapeMismatch, match="mask"):
-        list(score_frames([*good, bad, *good], workers=2))
+        score_frames([*good, bad, *good], workers=2)
 
 
 def test_a_removed_frame_never_scores_better_than_a_delivered_one():
@@ -368,21 +359,6 @@ def test_a_removed_frame_never_scores_better_than_a_delivered_one():
     declared = penalty()
     assert delivered["psnr"] > declared["psnr"]
     assert delivered["oriented_distance"] < declared["oriented_distance"]
-
-
-def test_frames_are_read_only_a_little_ahead():
-    read = 0
-
-    def source():
-        nonlocal read
-        for frame in frames(60):
-            read += 1
-            yield frame
-
-    results = score_frames(source(), workers=2)
-    next(results)
-    assert read <= 2 * 4 + 1
-    results.close()
 
 
 def textured(shape: tuple[int, int], seed: int) -> np.ndarray:
@@ -429,18 +405,6 @@ def test_constant_frames_as_truth_and_entry(level: int) -> None:
     best(score_frame(image, image, mask))
 
 
-@pytest.mark.parametrize("level", [1, 51, 255])
-def test_a_black_video_against_a_constant_one(level: int) -> None:
-    black = np.zeros((32, 24, 3), np.uint8)
-    scores = score_frame(black + np.uint8(level), black, np.ones((32, 24), bool), coverage=True)
-    # Variances are 0, so that only SSIM's luminance term with C1 = 0.01^2 is left.
-    share = level / 255.0
-    assert scores["psnr"] == pytest.approx(-20.0 * np.log10(share), abs=1e-9)
-    inner = 1e-4 / (share**2 + 1e-4)
-    assert scores["ssim_full"] == pytest.approx(inner, abs=1e-9)
-    assert all(np.isfinite(value) for value in scores.values())
-
-
 def test_memory_layout_changes_no_bit() -> None:
     prediction, target = textured((40, 30), 2), textured((40, 30), 3)
     mask = np.zeros((40, 30), np.uint8)
@@ -450,48 +414,6 @@ def test_memory_layout_changes_no_bit() -> None:
     given = wide, np.asfortranarray(target), mask[::-1][::-1]
     assert not any(array.flags.c_contiguous for array in given[:2])
     assert score_frame(*given) == expected
-
-
-def test_half_precision_scores_as_the_eight_bits_that_it_rounds_to() -> None:
-    target = textured((40, 30), 4)
-    mask = np.ones((40, 30), bool)
-    # A half between two 8-bit levels is off by 2^-12 at most, an eighth of a level: nothing moves.
-    best(score_frame((target / 255.0).astype(np.float16), target, mask, coverage=True))
-
-
-def test_2000_frames_are_read_as_they_are_scored() -> None:
-    """At no time more frames are alive than are read ahead."""
-    alive, most = 0, 0
-
-    class Counted(np.ndarray):
-        def __del__(self) -> None:
-            nonlocal alive
-            if self.base is None:
-                alive -= 1
-
-    image = textured((16, 16), 5)
-    mask = np.ones((16, 16), bool)
-
-    def read() -> Frame:
-        nonlocal alive, most
-        own = np.ndarray.__new__(Counted, image.shape, np.uint8)
-        own[:] = image
-        alive += 1
-        most = max(most, alive)
-        return Frame(image, own, mask, coverage=True)
-
-    done = sum(score.failure is None for score in score_frames([read] * 2000, workers=1))
-    assert done == 2000
-    assert most <= 3
-
-
-def test_numbers_that_no_image_has_are_refused() -> None:
-    image, mask = textured((16, 16), 6), np.ones((16, 16), bool)
-    for dtype in (np.int32, np.complex64, bool):
-        with pytest.raises(HwpError):
-            score_frame(image, image.astype(dtype), mask)
-    with pytest.raises(BadImage):
-        score_frame(image, np.full(image.shape, np.nan, np.float16), mask)
 
 
 def capture(id_, hands, perturbations, scores):

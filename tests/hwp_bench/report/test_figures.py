@@ -15,7 +15,6 @@ from hwp_bench.analysis.cost import analyse_cost
 from hwp_bench.analysis.pairing import group_runs
 from hwp_bench.report.figures import (
     PALETTE,
-    Bar,
     draw_bars,
     draw_pareto,
     inline_svg,
@@ -94,10 +93,8 @@ def test_names_of_two_figures_on_a_page_differ_and_every_reference_is_there() ->
 
 
 def test_bars_are_as_long_as_their_values_and_long_intervals_are_cut() -> None:
-    bars = [Bar(0, estimate(10.0, 5.0, 12.0)), Bar(1, estimate(20.0, -40.0, 90.0))]
-    root = drawn(
-        inline_svg(draw_bars({"Motion Blur": bars, "Light": [Bar(0, estimate(5))]}, "psnr"), "t")
-    )
+    bars = [estimate(10.0, 5.0, 12.0), estimate(20.0, -40.0, 90.0)]
+    root = drawn(inline_svg(draw_bars({"Motion Blur": bars, "Light": [estimate(5)]}, "psnr"), "t"))
     assert words(root) == ["Motion Blur", "10.00", "20.00", "Light", "5.00"]
     lengths = []
     for bar in of_class(root, "bar"):

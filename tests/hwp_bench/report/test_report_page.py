@@ -166,7 +166,7 @@ def test_the_first_sentence_says_what_the_numbers_say(sources) -> None:
 
 def test_pictures_stay_within_their_budget(sources) -> None:
     report = gather_report(*[sources[0], [sources[1]]], image_bytes=900)
-    assert report.left_out >= 1
+    assert report["left_out"] >= 1
     album = Album(10**6)
     uri = album.take(np.zeros((3000, 2000, 3), np.uint8))
     assert uri.startswith("data:image/jpeg;base64,")

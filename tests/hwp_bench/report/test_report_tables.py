@@ -304,7 +304,7 @@ def test_it_is_asked_for_by_name_and_stands_on_the_page(
     pictures = tmp_path / "captures" / "capture2" / "pictures"
     write_image(pictures / "free_view.png", np.full((20, 30, 3), 90, np.uint8))
     page = gather_report([ResultsSource(results, tmp_path)])
-    assert any("Novel views" in str(item) for item in page.tables)
-    ((method, uri),) = page.captures[0].views
+    assert any("Novel views" in str(item) for item in page["tables"])
+    ((method, uri),) = page["captures"][0]["views"]
     assert method == "One"
     assert uri.startswith("data:image/jpeg;base64,")

@@ -7,10 +7,21 @@ from pathlib import Path
 
 import pytest
 from hostile import folder_of, hostile_method
+from small_captures import CaptureMaker
 
+from hwp_bench.capture.splits import contiguous_split
+from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.manifest import read_manifest
+from hwp_bench.methods.request import write_request
 from hwp_bench.run.runner import DEFAULT_TIME_LIMIT, RunRecord, run_method
 from hwp_bench.run.sandbox.confinement import Confinement
+
+
+@pytest.fixture
+def request_folder(make_capture: CaptureMaker, tmp_path: Path) -> Path:
+    """The request of a small capture."""
+    split = contiguous_split("tiny", 20)
+    return write_request(tmp_path / "request", make_capture(frames=20), split, RunSettings({}))
 
 
 @pytest.fixture

@@ -9,14 +9,11 @@ import threading
 from pathlib import Path
 
 import pytest
-from denormal_probe import Probe, states
-from small_captures import CaptureMaker
+from denormal_probe import Probe
+from small_methods import write_manifest
 
 from hwp_bench.base.numerics import flushed, flushed_process, flushes, set_flush
-from hwp_bench.capture.splits import contiguous_split
-from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.manifest import read_manifest
-from hwp_bench.methods.request import write_request
 from hwp_bench.run.engine.processes import LocalJob, run_in_process
 from hwp_bench.run.runner import run_method
 
@@ -98,21 +95,17 @@ def test_the_process_of_a_job_flushes(tmp_path: Path, monkeypatch: pytest.Monkey
     assert all(found.values()), found
 
 
-def test_the_process_of_a_method_flushes(make_capture: CaptureMaker, tmp_path: Path) -> None:
+def test_the_process_of_a_method_flushes(request_folder: Path, tmp_path: Path) -> None:
     folder = tmp_path / "method"
     folder.mkdir()
     (folder / "probing.py").write_text(METHOD)
     (folder / "denormal_probe.py").write_text((TESTS / "denormal_probe.py").read_text())
-    (folder / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "probe"\n[entry]\npython = "probing:Method"\n'
-    )
-    split = contiguous_split("tiny", 20)
-    request = write_request(tmp_path / "request", make_capture(frames=20), split, RunSettings({}))
-    run_method(read_manifest(folder), "tiny", request, tmp_path / "out")
+    write_manifest(folder, "probe", 'python = "probing:Method"')
+    run_method(read_manifest(folder), "tiny", request_folder, tmp_path / "out")
     written = next((tmp_path / "out").rglob("states.json"))
     found = json.loads(written.read_text())
     assert all(found.values()), found
 
 
 def test_this_process_was_left_alone() -> None:
-    assert not states()["this"]
+    assert not flushes()

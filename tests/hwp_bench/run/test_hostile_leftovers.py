@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hostile import folder_of, hostile_method
+from small_methods import SUBMISSION, write_manifest
 
 from hwp_bench.base.errors import MethodFailed
 from hwp_bench.evaluation.scoring import read_prediction
@@ -90,9 +91,7 @@ def test_a_submission_of_links_is_refused(tmp_path: Path, which: str) -> None:
     sealed = folder_of(tmp_path / "sealed")
     write_image(sealed / "000018.png", np.full((8, 8, 3), 9, np.uint8))
     method = folder_of(tmp_path / "entry")
-    (method / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "links"\n[entry]\npredictions = "predictions"\n'
-    )
+    write_manifest(method, "links", SUBMISSION)
     folder = method / "predictions" / "tiny"
     folder.parent.mkdir()
     if which == "folder":

@@ -18,6 +18,7 @@ from pathlib import Path
 
 import pytest
 from hostile import folder_of, hostile_method
+from small_methods import write_manifest
 
 from hwp_bench.base.errors import MethodFailed
 from hwp_bench.methods.manifest import read_manifest
@@ -293,10 +294,7 @@ def _environment_of_the_author(tmp_path: Path, script: str) -> tuple[Path, Path]
     (method / "env" / "pyvenv.cfg").write_text("home = /usr/bin\n")
     (method / "env" / "bin" / "python").symlink_to(tool)
     (method / "go.sh").write_text(script)
-    (method / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "et"\n[entry]\n'
-        'command = ["{method}/env/bin/python", "{method}/go.sh"]\n'
-    )
+    write_manifest(method, "et", 'command = ["{method}/env/bin/python", "{method}/go.sh"]')
     return method, home
 
 

@@ -17,16 +17,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from small_captures import CaptureMaker
+from small_methods import write_manifest
 
 from hwp_bench.base import numerics as threads
 from hwp_bench.base.errors import UsageError
-from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.cli import program
 from hwp_bench.cli.program import Command, run_program
-from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.manifest import read_manifest
-from hwp_bench.methods.request import write_request
 from hwp_bench.run.engine.processes import LocalJob, run_in_process
 from hwp_bench.run.runner import run_method
 
@@ -157,7 +154,7 @@ def test_the_process_of_a_job_finds_what_is_ours_or_was_chosen(
 def test_the_process_of_a_method_finds_what_is_ours_or_was_chosen(
     chosen: dict[str, str],
     expected: dict[str, str],
-    make_capture: CaptureMaker,
+    request_folder: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -166,30 +163,21 @@ def test_the_process_of_a_method_finds_what_is_ours_or_was_chosen(
     folder = tmp_path / "method"
     folder.mkdir()
     (folder / "looking.py").write_text(METHOD)
-    (folder / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "look"\n[entry]\npython = "looking:Method"\n'
-    )
-    split = contiguous_split("tiny", 20)
-    request = write_request(tmp_path / "request", make_capture(frames=20), split, RunSettings({}))
-    run_method(read_manifest(folder), "tiny", request, tmp_path / "out")
+    write_manifest(folder, "look", 'python = "looking:Method"')
+    run_method(read_manifest(folder), "tiny", request_folder, tmp_path / "out")
     written = next((tmp_path / "out").rglob("found.json"))
     assert json.loads(written.read_text()) == expected
 
 
 def test_a_method_that_is_a_command_inherits_what_is_ours(
-    make_capture: CaptureMaker, tmp_path: Path
+    request_folder: Path, tmp_path: Path
 ) -> None:
     threads.wait_passively()  # as importing `hwp_bench` did in this process
     folder = tmp_path / "method"
     folder.mkdir()
     (folder / "look.py").write_text("import os; print(sorted(os.environ.items()))")
-    (folder / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "look"\n[entry]\n'
-        'command = ["{python}", "{method}/look.py"]\n'
-    )
-    split = contiguous_split("tiny", 20)
-    request = write_request(tmp_path / "request", make_capture(frames=20), split, RunSettings({}))
-    run_method(read_manifest(folder), "tiny", request, tmp_path / "out")
+    write_manifest(folder, "look", 'command = ["{python}", "{method}/look.py"]')
+    run_method(read_manifest(folder), "tiny", request_folder, tmp_path / "out")
     printed = (tmp_path / "out" / "log.txt").read_text()
     for name in ("OMP_WAIT_POLICY", *threads.OPENCV_WAITING):
         assert repr((name, OURS[name])) in printed

@@ -10,7 +10,7 @@ import pytest
 from engine_jobs import Told, Write, write_job
 
 from hwp_bench.base.errors import BadInput, HwpError, UsageError
-from hwp_bench.run.engine import Engine, LocalEngine, Needs
+from hwp_bench.run.engine import Engine, LocalEngine, Needs, processes
 from hwp_bench.run.engine.processes import ParallelEngine, divide_gpus
 
 
@@ -82,19 +82,23 @@ def test_finished_jobs_do_not_run_and_threads_follow_the_needs(
     ("by", "reason"), [(signal.SIGKILL, "SIGKILL"), (signal.SIGTERM, "interrupted")]
 )
 def test_a_job_whose_process_is_killed_starts_again_but_not_for_ever(
-    tmp_path: Path, by: int, reason: str
+    tmp_path: Path, by: int, reason: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     graves = tmp_path / "graves"
     graves.mkdir()
     view = Told()
     jobs = [write_job(tmp_path / "out", Write("job", deaths=2, by=by, graves=graves))]
-    ParallelEngine(1, view, retries=2).run(jobs, lambda index: None)
+    ParallelEngine(
+        1,
+        view,
+    ).run(jobs, lambda index: None)
     assert len(list(graves.iterdir())) == 2
     assert len(view.starts) == 3
     assert sum("again, its worker was lost" in text for text in view.said) == 2
     jobs = [write_job(tmp_path / "out", Write("other", deaths=9, by=by, graves=graves))]
+    monkeypatch.setattr(processes, "RETRIES", 1)
     with pytest.raises(HwpError, match=rf"'other' was lost 2 times \({reason}\)"):
-        ParallelEngine(1, retries=1).run(jobs, lambda index: None)
+        ParallelEngine(1).run(jobs, lambda index: None)
     assert set(texts(tmp_path / "out")) == {"job"}
 
 

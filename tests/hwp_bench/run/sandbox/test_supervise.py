@@ -173,9 +173,9 @@ def test_a_control_group_is_made_where_there_can_be_one(tmp_path: Path) -> None:
     """Oracle: the kernel's documents (Control Group v2); the files here are plain ones."""
     shell = tmp_path / "user.slice" / "shell.scope"
     shell.mkdir(parents=True)
-    assert control_group(LIMIT, tmp_path, "0::/user.slice/shell.scope\n") is None
+    assert control_group(LIMIT, 12, tmp_path, "0::/user.slice/shell.scope\n") is None
     (shell.parent / "cgroup.subtree_control").write_text("cpu memory pids\n")
-    group = control_group(LIMIT, tmp_path, "0::/user.slice/shell.scope\n")
+    group = control_group(LIMIT, 12, tmp_path, "0::/user.slice/shell.scope\n")
     assert group is not None
     assert group.folder.parent == shell.parent
     assert (group.folder / "memory.max").read_text() == str(LIMIT)
@@ -183,21 +183,19 @@ def test_a_control_group_is_made_where_there_can_be_one(tmp_path: Path) -> None:
     old = shell.parent / "hwp-bench-old"
     old.mkdir()
     os.utime(old, (0, 0))
-    control_group(LIMIT, tmp_path, "0::/user.slice/shell.scope\n")
+    control_group(LIMIT, 13, tmp_path, "0::/user.slice/shell.scope\n")
     assert not old.exists()
-    group.take(12)
     assert (group.folder / "cgroup.procs").read_text() == "12"
     assert group.kills() == 0
     (group.folder / "memory.events").write_text("low 0\noom 1\noom_kill 2\n")
     assert group.kills() == 2
-    assert control_group(LIMIT, tmp_path, "0::/../../elsewhere\n") is None
+    assert control_group(LIMIT, 12, tmp_path, "0::/../../elsewhere\n") is None
 
 
 def test_a_kill_in_a_control_group_is_the_limit(attack, monkeypatch, tmp_path: Path) -> None:
     (tmp_path / "group").mkdir()
     (tmp_path / "group" / "memory.events").write_text("oom_kill 1\n")
     group = ControlGroup(tmp_path / "group")
-    monkeypatch.setattr(supervise, "control_group", lambda limit: group)
+    monkeypatch.setattr(supervise, "control_group", lambda limit, process: group)
     with pytest.raises(MethodFailed, match=r"took more than 0\.2 GB of memory"):
         attack("os.kill(os.getpid(), 9)", "none", memory_limit=LIMIT)
-    assert (tmp_path / "group" / "cgroup.procs").read_text() != str(os.getpid())
