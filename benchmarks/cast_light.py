@@ -23,7 +23,7 @@ from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import load_avatar
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.light import CastLight
-from wildghand.light.fit_lights import CONE, SKY
+from wildghand.light.light import CONE, SKY
 from wildghand.model.dress import Gaussians
 from wildghand.model.frames import rasterize_hands
 
@@ -49,8 +49,7 @@ def white_hands(avatar: WildGHandAvatar, capture: Capture, frame: int) -> list[n
     factors: list[list[Tensor]] = []
     for side, given in hands.items():
         anchors = model.rigs[side].pose(*given)
-        shading = model.shadows.shading(quat_third_axis(anchors.orientations))
-        lit = torch.ones_like(dark[side]) if shading is None else shading
+        lit = model.shadows.shading(quat_third_axis(anchors.orientations))
         parts.append(model.gaussians(side, *given, dark=dark[side])[0])
         factors.append([lit, lit * dark[side], dark[side]])
     pictures = []

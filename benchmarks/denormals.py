@@ -35,7 +35,10 @@ CONSTANTS: dict[str, Any] = {"gain_weight": 0.1, "tint_weight": 1.0, "omega_weig
 #: Those of the other terms.
 FADED_WEIGHTS = {
     "ours": terms.TermWeights(
-        **{name: FADED * w for name, w in dataclasses.asdict(terms.WEIGHTS["ours"]).items()}
+        **{
+            name: weight if isinstance(weight, bool) else FADED * weight
+            for name, weight in dataclasses.asdict(terms.WEIGHTS["ours"]).items()
+        }
     )
 }
 

@@ -34,7 +34,6 @@ from hwp_bench.methods.request import open_request, write_request
 from hwp_bench.sim.produce.truth import add_subject_mesh
 from wildghand.fitting.data import FitData
 from wildghand.fitting.start import find_person
-from wildghand.model.settings import read_settings
 from wildghand.subject import SubjectShape, unknowns
 from wildghand.subject.shape import side_flip
 
@@ -62,12 +61,12 @@ class Person:
 
     def shape(self, spreads: Mapping[str, Any], validation: bool) -> tuple[SubjectShape, float]:
         """The shape that a fit finds, and its seconds."""
-        data, settings = FitData(self.training, torch.device("cpu")), read_settings({}).subject
+        data = FitData(self.training, torch.device("cpu"))
         judges = data.judges if validation else None
         _ = data.frames  # read before the clock starts
         began = time.perf_counter()
         with mock.patch.multiple(unknowns, **spreads):
-            shape = find_person(data, settings, judges)
+            shape = find_person(data, judges)
         assert shape is not None
         return shape, time.perf_counter() - began
 

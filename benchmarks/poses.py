@@ -26,7 +26,6 @@ from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.hands import HandParameters
 from hwp_bench.hands.poses import posed_skeleton, rest_skeleton
 from hwp_bench.sim.produce.suites import ensure_suite, suite_names
-from wildghand.model.settings import WildGHandSettings
 from wildghand.poses import believed_hands
 
 #: Colours of the drawn hands, sRGB.
@@ -56,8 +55,7 @@ class Poses:
             raise SystemExit(f"{capture.root}: knows no true hands")
         templates = {side: capture.template(side) for side in capture.info.sides}
         began = time.perf_counter()
-        settings = WildGHandSettings().poses
-        believed = believed_hands(templates, capture.hands, capture.cameras, settings)
+        believed = believed_hands(templates, capture.hands, capture.cameras)
         return cls(capture, capture.hands, believed, truth, time.perf_counter() - began)
 
     def landmarks(self, hand: HandParameters, side: str) -> np.ndarray:

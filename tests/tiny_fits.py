@@ -15,6 +15,8 @@ TINY: dict[str, Any] = {
 #: The same with nothing that looks at the frames before the first step: no verdict on them, and the
 #: hand model as it is.
 UNJUDGED: dict[str, Any] = {**TINY, "prepass.enabled": False, "subject.enabled": False}
+#: The network alone.
+BARE: dict[str, Any] = {**TINY, "mode": "bare"}
 #: A network that learns what a small clip shows.
 QUICK: dict[str, Any] = {
     "gaussians": 600,

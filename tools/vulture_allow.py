@@ -15,6 +15,24 @@ SpaceMethod  # the entry of baselines/texture-space/method.toml
 ShadowMethod  # the entry of baselines/shadow-albedo/method.toml
 write_splits  # writes what `read_splits` reads; benchmarks and organizers call it
 OneShotMethod  # the entry of baselines/one-shot-prior/method.toml
+_.ambient_rate  # `Recipe.rates` reads it by the tensor's name
+_.betas_rate  # `Recipe.rates` reads it by the tensor's name
+_.bias_rate  # `Recipe.rates` reads it by the tensor's name
+_.displacement_rate  # `Recipe.rates` reads it by the tensor's name
+_.frame_rate  # `Recipe.rates` reads it by the tensor's name
+_.gaussian_rate  # `Recipe.rates` reads it by the tensor's name
+_.identity_rate  # `Recipe.rates` reads it by the tensor's name
+_.lamp_rate  # `Recipe.rates` reads it by the tensor's name
+_.latent_rate  # `Recipe.rates` reads it by the tensor's name
+_.network_rate  # `Recipe.rates` reads it by the tensor's name
+_.occluder_color_rate  # `Recipe.rates` reads it by the tensor's name
+_.occluder_opacity_rate  # `Recipe.rates` reads it by the tensor's name
+_.occluder_place_rate  # `Recipe.rates` reads it by the tensor's name
+_.occluder_shape_rate  # `Recipe.rates` reads it by the tensor's name
+_.pose_rate  # `Recipe.rates` reads it by the tensor's name
+_.shadow_rate  # `Recipe.rates` reads it by the tensor's name
+_.texture_rate  # `Recipe.rates` reads it by the tensor's name
+_.transl_rate  # `Recipe.rates` reads it by the tensor's name
 WildGHandMethod  # the entry of wildghand/method.toml and of baselines/network-scratch
 check_networks  # `check_files` of wildghand/method.toml and of baselines/network-scratch
 modified  # part of the cache's key: a changed file is read again

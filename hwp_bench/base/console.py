@@ -17,7 +17,6 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextvars import ContextVar, Token
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Self, TextIO, TypeVar
 
 from hwp_bench.base.errors import shown
@@ -68,16 +67,10 @@ def expressed(text: str, encoding: str) -> str:
     try:
         text.encode(encoding)
     except UnicodeEncodeError:
-        return "".join(_expressed(char, encoding) for char in text)
+        if len(text) > 1:
+            return "".join(expressed(char, encoding) for char in text)
+        return _FORMS.get(text) or text.encode("ascii", "backslashreplace").decode("ascii")
     return text
-
-
-def _expressed(char: str, encoding: str) -> str:
-    try:
-        char.encode(encoding)
-    except UnicodeEncodeError:
-        return _FORMS.get(char) or char.encode("ascii", "backslashreplace").decode("ascii")
-    return char
 
 
 def print_document(text: str) -> None:
@@ -254,15 +247,10 @@ def progress(description: str, total: int) -> Iterator[Callable[[int], None]]:
             yield update
         return
     if not on_terminal(sys.stderr):
-        reached = 0
-
-        def reach(done: int) -> None:
-            nonlocal reached
-            reached = done
-
-        yield reach
+        reached = [0]
+        yield reached.append
         # Work may end early: by its budget, or because nothing gets better any more.
-        share = f"{total}" if reached == total else f"{reached} of {total}"
+        share = f"{total}" if reached[-1] == total else f"{reached[-1]} of {total}"
         notice(f"{description}: {share} in {time.perf_counter() - start:.1f} s")
         return
     with new_bars() as bars:
@@ -279,22 +267,12 @@ def track(items: Iterable[Item], description: str, total: int | None = None) -> 
             update(done)
 
 
-class JobsView:
-    """Shows jobs: a bar for all of them and one for each that runs.
+class _Display:
+    """Bars on a terminal while a block runs, nothing elsewhere; a context manager."""
 
-    Elsewhere than on a terminal a line of text says that a job begins, and one that it has ended.
-    A context manager. Jobs that run one after another are told to `turn`. An engine that runs
-    several at once calls `begin`, then `start`, `steps`, `end` and `drop` with the index of a job,
-    from any thread.
-    """
-
-    def __init__(self, *, quiet: bool = False) -> None:
-        self._quiet = quiet
-        self._bars = new_bars() if on_terminal(sys.stderr) and not quiet else None
+    def __init__(self, *, shown: bool = True) -> None:
+        self._bars = new_bars() if shown and on_terminal(sys.stderr) else None
         self._all: TaskID | None = None
-        self._running: dict[int, _Running] = {}
-        self._durations: list[float] = []
-        self._count = self._ended = 0
         self._began = time.perf_counter()
 
     def __enter__(self) -> Self:
@@ -305,6 +283,24 @@ class JobsView:
     def __exit__(self, *_: object) -> None:
         if self._bars is not None:
             self._bars.stop()
+
+
+class JobsView(_Display):
+    """Shows jobs: a bar for all of them and one for each that runs.
+
+    Elsewhere than on a terminal a line of text says that a job begins, and one that it has ended.
+    Jobs that run one after another are told to `turn`. An engine that runs
+    several at once calls `begin`, then `start`, `steps`, `end` and `drop` with the index of a job,
+    from any thread.
+    """
+
+    def __init__(self, *, quiet: bool = False) -> None:
+        super().__init__(shown=not quiet)
+        self._quiet = quiet
+        #: When each job that runs has begun, and its bar.
+        self._running: dict[int, tuple[float, TaskID | None]] = {}
+        self._durations: list[float] = []
+        self._count = self._ended = 0
 
     def turn(self, index: int, count: int, text: str) -> Callable[[int, int], None]:
         """Begin job `index` of `count`, after the one before it has ended."""
@@ -343,9 +339,9 @@ class JobsView:
 
     def steps(self, index: int, done: int, total: int) -> None:
         """Say how far a job is."""
-        job = self._running.get(index)
-        if self._bars is not None and job is not None and job.task is not None:
-            update_bar(self._bars, job.task, job.began, done, total)
+        began, task = self._running.get(index, (0.0, None))
+        if self._bars is not None and task is not None:
+            update_bar(self._bars, task, began, done, total)
             self._update_all()
 
     def end(self, index: int, text: str, problem: str | None = None) -> None:
@@ -371,17 +367,18 @@ class JobsView:
 
     def drop(self, index: int) -> float | None:
         """Take a job out of the view; returns the seconds that it ran, None if it did not."""
-        job = self._running.pop(index, None)
-        if job is None:
+        if index not in self._running:
             return None
-        if job.task is not None and self._bars is not None:
-            self._bars.remove_task(job.task)
-        return time.perf_counter() - job.began
+        began, task = self._running.pop(index)
+        if task is not None and self._bars is not None:
+            self._bars.remove_task(task)
+        return time.perf_counter() - began
 
     def _add(self, index: int, text: str) -> None:
-        job = self._running[index] = _Running()
+        began, task = time.perf_counter(), None
         if self._bars is not None:
-            job.task = self._bars.add_task(f"  [{index + 1}] {text}", total=None, left="")
+            task = self._bars.add_task(f"  [{index + 1}] {text}", total=None, left="")
+        self._running[index] = began, task
         self._update_all()
 
     def _update_all(self) -> None:
@@ -390,17 +387,9 @@ class JobsView:
         left = remaining(self._durations, self._count - self._ended)
         if left is not None and self._running:
             now = time.perf_counter()
-            spent = sum(now - job.began for job in list(self._running.values()))
+            spent = sum(now - began for began, _ in list(self._running.values()))
             left = max(left - spent, 0.0) / len(self._running)
         self._bars.update(self._all, completed=self._ended, left=left_text(left))
-
-
-@dataclass
-class _Running:
-    """A job that runs."""
-
-    began: float = field(default_factory=lambda: time.perf_counter())
-    task: TaskID | None = None
 
 
 def new_bars() -> Progress:
@@ -435,31 +424,28 @@ def left_text(seconds: float | None) -> str:
     return "" if seconds is None else f", about {clock(seconds)} left"
 
 
-class StagesView:
+class StagesView(_Display):
     """Shows stages of unequal length, one after the other, and how much is left of all.
 
     On a terminal one bar for all of them, and below it those that `progress` and `track` show
-    within a stage; elsewhere a line at the beginning of each. A context manager.
+    within a stage; elsewhere a line at the beginning of each.
     """
 
     def __init__(self) -> None:
-        self._bars = new_bars() if on_terminal(sys.stderr) else None
-        self._all: TaskID | None = None
-        self._began = self._stage_began = time.perf_counter()
+        super().__init__()
+        self._stage_began = self._began
         self._left: tuple[float, float] = (0.0, 0.0)
         self._outer: Token[Shows | None] | None = None
 
     def __enter__(self) -> Self:
         if self._bars is not None:
-            self._bars.start()
             self._outer = OUTER.set(self.part)
-        return self
+        return super().__enter__()
 
     def __exit__(self, *_: object) -> None:
         if self._outer is not None:
             OUTER.reset(self._outer)
-        if self._bars is not None:
-            self._bars.stop()
+        super().__exit__()
 
     def stage(self, number: int, count: int, text: str, *, own: float, later: float) -> None:
         """Begin a stage."""

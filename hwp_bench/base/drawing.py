@@ -20,33 +20,19 @@ HOT_ERROR = 64
 
 
 def labelled(tile: np.ndarray, text: str) -> np.ndarray:
-    """Return a tile with a line of text over it.
-
-    Args:
-        tile: (H, W, 3) uint8.
-    """
+    """Return a tile (H, W, 3) uint8 with a line of text over it."""
     strip = np.full((LABEL_HEIGHT, tile.shape[1], 3), PAPER, dtype=np.uint8)
     # The vector fonts of OpenCV know ASCII only.
     shown = text.encode("ascii", "replace").decode()
-    while shown and _width(shown) > tile.shape[1] - 4:
+    font = cv2.FONT_HERSHEY_SIMPLEX, 0.4
+    while shown and cv2.getTextSize(shown, *font, 1)[0][0] > tile.shape[1] - 4:
         shown = shown[:-1]
-    cv2.putText(strip, shown, (2, 13), cv2.FONT_HERSHEY_SIMPLEX, 0.4, INK, 1, cv2.LINE_AA)
+    cv2.putText(strip, shown, (2, 13), *font, INK, 1, cv2.LINE_AA)
     return np.concatenate([strip, tile])
 
 
-def _width(text: str) -> int:
-    return cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.4, 1)[0][0]
-
-
 def sheet(tiles: Sequence[np.ndarray], columns: int) -> np.ndarray:
-    """Return tiles laid out in rows.
-
-    Args:
-        tiles: (H, W, 3) uint8 images; smaller ones are centred in the largest cell.
-
-    Returns:
-        (rows, columns, 3) uint8.
-    """
+    """Return tiles (H, W, 3) laid out in rows; smaller ones are centred in the largest cell."""
     height = max(tile.shape[0] for tile in tiles) + GAP
     width = max(tile.shape[1] for tile in tiles) + GAP
     columns = min(columns, len(tiles))
@@ -59,32 +45,19 @@ def sheet(tiles: Sequence[np.ndarray], columns: int) -> np.ndarray:
     return page
 
 
-def outlined(
-    image: np.ndarray, mask: np.ndarray, colour: tuple[int, int, int] = (0, 255, 80)
-) -> np.ndarray:
-    """Return an image with the outline of a mask.
-
-    Args:
-        image: (H, W, 3) uint8.
-        mask: (H, W) uint8, above 127 is inside.
-    """
+def outlined(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Return an image (H, W, 3) with the outline of a mask (H, W), whose inside is above 127."""
     contours, _ = cv2.findContours(
         (mask > 127).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE
     )
-    return cv2.drawContours(image.copy(), contours, -1, colour, 1, cv2.LINE_8)
+    return cv2.drawContours(image.copy(), contours, -1, (0, 255, 80), 1, cv2.LINE_8)
 
 
 def error_map(prediction: np.ndarray, target: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """Return the error of a prediction in colours, black outside the mask.
 
-    Args:
-        prediction: (H, W, 3) uint8.
-        target: (H, W, 3) uint8.
-        mask: (H, W) bool.
-
-    Returns:
-        (H, W, 3) uint8: the largest channel's absolute difference, from dark (0) to bright
-        yellow (`HOT_ERROR` levels and more).
+    It is the largest channel's absolute difference, from dark (0) to bright yellow (`HOT_ERROR`
+    levels and more): (H, W, 3) uint8, as both images.
     """
     difference = np.abs(prediction.astype(np.int16) - target).max(axis=2)
     levels = np.clip(difference * (255 / HOT_ERROR), 0, 255).astype(np.uint8)

@@ -7,6 +7,7 @@ that reaches a user is a bug of ours.
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import math
 import numbers
@@ -43,12 +44,8 @@ class HwpError(Exception):
         self.where = None if where is None else os.fspath(where)
         self.field = field
         self.remedy = remedy
-        super().__init__(self._message())
-
-    def _message(self) -> str:
-        parts = [part for part in (self.where, self.field) if part]
-        head = ": ".join([*parts, self.problem])
-        return f"{head}. {self.remedy}" if self.remedy else head
+        head = ": ".join(part for part in (self.where, self.field, problem) if part)
+        super().__init__(f"{head}. {remedy}" if remedy else head)
 
 
 def reason_of(error: OSError) -> str:
@@ -142,9 +139,9 @@ def nearest(wrong: str, known: Iterable[str], *, most: int = 1, cutoff: float = 
     return difflib.get_close_matches(wrong[:200], list(known), n=most, cutoff=cutoff)
 
 
-def did_you_mean(wrong: str, known: Iterable[str], *, cutoff: float = 0.6) -> str:
+def did_you_mean(wrong: str, known: Iterable[str]) -> str:
     """Return `Did you mean 'NAME'?` of the nearest known name; empty where none is near."""
-    near = nearest(wrong, known, cutoff=cutoff)
+    near = nearest(wrong, known)
     return f"Did you mean {near[0]!r}?" if near else ""
 
 
@@ -184,22 +181,17 @@ def one_line(text: str, most: int = 1000) -> str:
 
 def whole_number(value: Any, field: str) -> int:
     """Return an integer of Python or NumPy as Python's."""
-    if not isinstance(value, bool):
-        try:
+    with contextlib.suppress(TypeError):
+        if not isinstance(value, bool):
             return operator.index(value)
-        except TypeError:
-            pass
     raise _wrong(value, field, "an integer")
 
 
 def real_number(value: Any, field: str) -> float:
     """Return a finite number of Python or NumPy as Python's."""
-    if isinstance(value, numbers.Real) and not isinstance(value, bool):
-        try:
-            number = float(value)
-        except OverflowError:
-            number = math.inf
-        if math.isfinite(number):
+    with contextlib.suppress(OverflowError):
+        real = isinstance(value, numbers.Real) and not isinstance(value, bool)
+        if real and math.isfinite(number := float(value)):
             return number
     raise _wrong(value, field, "a finite number")
 

@@ -63,9 +63,7 @@ def atomic_write(
         if isinstance(error, FileExistsError) and not overwrite:
             raise _exists(path, flag) from error
         raise HwpError(
-            f"cannot be written ({reason_of(error)})",
-            where=path,
-            remedy=_room(path),
+            f"cannot be written ({reason_of(error)})", where=path, remedy=_room(path)
         ) from error
     return path
 
@@ -199,9 +197,7 @@ def atomic_folder(
     except OSError as error:
         shutil.rmtree(temporary, ignore_errors=True)
         raise HwpError(
-            f"cannot be written ({reason_of(error)})",
-            where=path,
-            remedy=_room(path),
+            f"cannot be written ({reason_of(error)})", where=path, remedy=_room(path)
         ) from error
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
@@ -270,19 +266,21 @@ def check_is_file(
     error: type[BadInput] = BadInput,
 ) -> None:
     """Refuse all but a regular file, before something waits for a pipe or reads a device."""
+
+    def refuse(problem: str) -> BadInput:
+        return error(problem, where=path, field=field, remedy=remedy)
+
     try:
         mode = path.stat().st_mode
     except (FileNotFoundError, NotADirectoryError) as missing:
-        raise error("does not exist", where=path, field=field, remedy=remedy) from missing
+        raise refuse("does not exist") from missing
     except (OSError, ValueError) as failure:
         reason = getattr(failure, "strerror", None) or "its name cannot be used"
-        problem = f"cannot be read ({reason})"
-        raise error(problem, where=path, field=field, remedy=remedy) from failure
+        raise refuse(f"cannot be read ({reason})") from failure
     if not stat.S_ISREG(mode):
         kinds = ((stat.S_ISDIR, "a folder"), (stat.S_ISFIFO, "a pipe"), (stat.S_ISSOCK, "a socket"))
         kind = next((name for test, name in kinds if test(mode)), "a device")
-        problem = f"is {kind} where a file is expected"
-        raise error(problem, where=path, field=field, remedy=remedy)
+        raise refuse(f"is {kind} where a file is expected")
 
 
 def sha256_of(path: Path) -> str:
@@ -312,11 +310,13 @@ def read_json(path: str | os.PathLike[str], *, max_bytes: int = MAX_JSON_BYTES) 
         text = _read_bounded(path, max_bytes).decode()
         value = json.loads(
             text,
-            parse_constant=_refuse_constant,
+            parse_constant=_finite,
             parse_float=_finite,
             parse_int=_bounded_int,
             object_pairs_hook=_table,
         )
+        for _ in inner_values(value, MAX_JSON_DEPTH):
+            pass
     except FileNotFoundError as error:
         raise BadInput("does not exist", where=path) from error
     except OSError as error:
@@ -333,8 +333,6 @@ def read_json(path: str | os.PathLike[str], *, max_bytes: int = MAX_JSON_BYTES) 
         ) from error
     except ValueError as error:
         raise BadInput(f"is not valid JSON ({error})", where=path) from error
-    if _deeper_than(value, MAX_JSON_DEPTH):
-        raise BadInput("is nested too deeply", where=path)
     if _SURROGATE.search(text) and not is_unicode(json.dumps(value, ensure_ascii=False)):
         raise BadInput(
             "holds text that is not Unicode (half of a surrogate pair)",
@@ -357,19 +355,24 @@ def _read_bounded(path: Path, max_bytes: int) -> bytes:
     return data
 
 
-def _deeper_than(value: Any, limit: int) -> bool:
-    level = [value]
-    for _ in range(limit):
+def inner_values(value: Any, most: int) -> Iterator[Any]:
+    """Every value inside of lists and tables, level by level.
+
+    Raises:
+        RecursionError: there are more than `most` levels.
+    """
+    level = [value] if isinstance(value, dict | list) else []
+    for _ in range(most):
         level = [
             item
             for holder in level
-            if isinstance(holder, dict | list)
             for item in (holder.values() if isinstance(holder, dict) else holder)
-            if isinstance(item, dict | list)
         ]
+        yield from level
+        level = [item for item in level if isinstance(item, dict | list)]
         if not level:
-            return False
-    return True
+            return
+    raise RecursionError
 
 
 class _RepeatedKey(ValueError):
@@ -377,24 +380,19 @@ class _RepeatedKey(ValueError):
 
 
 def _table(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    table = dict(pairs)
-    if len(table) < len(pairs):
-        seen: set[str] = set()
-        for name, _ in pairs:
-            if name in seen:
-                raise _RepeatedKey(name)
-            seen.add(name)
+    table: dict[str, Any] = {}
+    for name, value in pairs:
+        if name in table:
+            raise _RepeatedKey(name)
+        table[name] = value
     return table
-
-
-def _refuse_constant(name: str) -> float:
-    raise ValueError(f"{name} is not a JSON number")
 
 
 def _finite(text: str) -> float:
     number = float(text)
     if not math.isfinite(number):
-        raise ValueError(f"{text[:20]} is too large a number")
+        what = "too large a number" if text[-1].isdigit() else "not a JSON number"
+        raise ValueError(f"{text[:20]} is {what}")
     return number
 
 

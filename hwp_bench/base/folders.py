@@ -95,7 +95,9 @@ def remove_left(prefix: str) -> None:
     for folder in Path(tempfile.gettempdir()).glob(f"{prefix}*"):
         with contextlib.suppress(OSError, NotImplementedError, Timeout):
             facts = folder.lstat()
-            if not stat.S_ISDIR(facts.st_mode) or facts.st_uid != _user(facts):
+            # Every file is this user's on systems that number no users.
+            user = os.getuid() if hasattr(os, "getuid") else facts.st_uid
+            if not stat.S_ISDIR(facts.st_mode) or facts.st_uid != user:
                 continue
             file = folder / LOCK
             if file.is_symlink() or not file.is_file():
@@ -104,11 +106,6 @@ def remove_left(prefix: str) -> None:
                 continue
             with FileLock(file, timeout=0):
                 shutil.rmtree(folder, ignore_errors=True)
-
-
-def _user(facts: os.stat_result) -> int:
-    """This user's number; every file is this user's on systems that have no numbers."""
-    return os.getuid() if hasattr(os, "getuid") else facts.st_uid
 
 
 #: Deepest folder that a run has a reason to write, below its output.
@@ -142,7 +139,7 @@ def open_up(folder: Path) -> None:
     Files lose what gives rights to whoever runs them: set-user-id, set-group-id, capabilities.
     To be called when no process that writes there is left.
     """
-    waiting = [(os.fspath(folder), 0)]
+    waiting, remover = [(os.fspath(folder), 0)], shutil.which("rm")
     while waiting:
         place, depth = waiting.pop()
         with contextlib.suppress(OSError):
@@ -156,8 +153,10 @@ def open_up(folder: Path) -> None:
                 mode = entry.stat(follow_symlinks=False).st_mode
                 if stat.S_ISDIR(mode) and depth < DEEPEST:
                     waiting.append((entry.path, depth + 1))
-                elif stat.S_ISDIR(mode):
-                    _remove_deep(entry.path)
+                elif stat.S_ISDIR(mode) and remover:
+                    # `rm` goes down by descriptors, and not by paths.
+                    command = [remover, "-rf", "--", entry.path]
+                    subprocess.run(command, check=False, stderr=subprocess.DEVNULL, timeout=600)
                 elif not stat.S_ISREG(mode):
                     os.unlink(entry.path)
                 else:
@@ -172,14 +171,6 @@ def _take_rights(path: str, mode: int) -> None:
     if mode & 0o111 and hasattr(os, "removexattr"):
         with contextlib.suppress(OSError):
             os.removexattr(path, "security.capability", follow_symlinks=False)
-
-
-def _remove_deep(folder: str) -> None:
-    """Remove a folder of any depth; `rm` goes down by descriptors, and not by paths."""
-    if remover := shutil.which("rm"):
-        subprocess.run(
-            [remover, "-rf", "--", folder], check=False, stderr=subprocess.DEVNULL, timeout=600
-        )
 
 
 #: Permissions that let others than the owner write.

@@ -12,11 +12,11 @@ import hashlib
 import itertools
 import os
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from pathlib import Path
 from types import ModuleType
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 import OpenImageIO as oiio
@@ -62,23 +62,14 @@ def is_blank(pixels: np.ndarray) -> bool:
 
 
 def read_rgb(path: str | os.PathLike[str], size: tuple[int, int] | None = None) -> np.ndarray:
-    """Read a colour image.
-
-    Returns:
-        (H, W, 3) uint8, sRGB.
-    """
+    """Read a colour image: (H, W, 3) uint8, sRGB."""
     pixels = _read(Path(path), size)
-    if pixels.shape[2] < 3:
-        return np.ascontiguousarray(np.repeat(pixels[:, :, :1], 3, axis=2))
-    return np.ascontiguousarray(pixels[:, :, :3])
+    channels = [0, 0, 0] if pixels.shape[2] < 3 else [0, 1, 2]
+    return np.ascontiguousarray(pixels[:, :, channels])
 
 
 def read_gray(path: str | os.PathLike[str], size: tuple[int, int] | None = None) -> np.ndarray:
-    """Read a one-channel image (a mask); of a colour image the first channel is taken.
-
-    Returns:
-        (H, W) uint8.
-    """
+    """Read a one-channel image (a mask), (H, W) uint8: of a colour image the first channel."""
     return np.ascontiguousarray(_read(Path(path), size)[:, :, 0])
 
 
@@ -104,11 +95,9 @@ def _read(path: Path, size: tuple[int, int] | None) -> np.ndarray:
             raise BadImage(f"holds {spec.format} samples where 8-bit is expected", where=path)
         turned = spec.get_int_attribute("Orientation", 1)
         if turned != 1:
-            raise BadImage(
-                f"asks to be turned when it is shown (EXIF orientation {turned})",
-                where=path,
-                remedy="Store its pixels upright, without that mark.",
-            )
+            problem = f"asks to be turned when it is shown (EXIF orientation {turned})"
+            remedy = "Store its pixels upright, without that mark."
+            raise BadImage(problem, where=path, remedy=remedy)
         pixels = source.read_image(format=oiio.UINT8)
         # OpenImageIO fills what a truncated file lacks with zeros and only sets an error.
         problem = source.geterror().strip()
@@ -279,9 +268,19 @@ QUALITY = 18
 _MATRIX, _PRIMARIES, _TRANSFER, _LIMITED = 6, 1, 1, 1
 
 
-def check_encoder() -> None:
-    """Refuse to begin minutes of work whose video could not be written."""
-    _library()
+def check_encoder() -> ModuleType:
+    """Refuse to begin minutes of work whose video could not be written; returns PyAV."""
+    try:
+        import av
+
+        av.codec.Codec(ENCODER, "w")
+    except (ImportError, ValueError) as error:
+        raise MissingDependency(
+            "nothing here can encode H.264, which videos are written in",
+            remedy="Install PyAV: pip install av",
+        ) from error
+    library: ModuleType = av
+    return library
 
 
 def write_movie(path: str | os.PathLike[str], frames: Iterable[np.ndarray], fps: float) -> Path:
@@ -294,7 +293,7 @@ def write_movie(path: str | os.PathLike[str], frames: Iterable[np.ndarray], fps:
             sizes: an odd row or column at the end is doubled.
     """
     path = Path(path)
-    av = _library()
+    av = check_encoder()
     partial = path.with_name(f".{os.getpid()}.{path.stem}.mp4")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -309,14 +308,29 @@ def write_movie(path: str | os.PathLike[str], frames: Iterable[np.ndarray], fps:
 
 
 def _encode(
-    av: ModuleType, partial: Path, frames: Iterable[np.ndarray], fps: float, path: Path
+    av: ModuleType, partial: Path, frames: Iterator[np.ndarray], fps: float, path: Path
 ) -> None:
-    frames = iter(frames)
     first = next(frames, None)
     if first is None:
         raise ShapeMismatch("a video needs a frame", where=path)
     with av.open(str(partial), "w", format="mp4", options={"movflags": "faststart"}) as container:
-        stream = _stream(container, first, fps)
+        height, width = (edge + edge % 2 for edge in first.shape[:2])
+        rate = Fraction(fps).limit_denominator(1000)
+        options = {"crf": str(QUALITY), "preset": "medium", "profile": "high"}
+        stream = container.add_stream(ENCODER, rate=rate, options=options)
+        settings = {
+            "width": width,
+            "height": height,
+            "pix_fmt": "yuv420p",
+            "time_base": 1 / rate,
+            "colorspace": _MATRIX,
+            "color_primaries": _PRIMARIES,
+            "color_trc": _TRANSFER,
+            "color_range": _LIMITED,
+            "thread_count": 1,
+        }
+        for name, value in settings.items():
+            setattr(stream.codec_context, name, value)
         for number, image in enumerate(itertools.chain([first], frames)):
             if image.shape != first.shape or image.ndim != 3 or image.dtype != np.uint8:
                 raise ShapeMismatch(
@@ -328,52 +342,13 @@ def _encode(
         container.mux(stream.encode(None))
 
 
-def _stream(container: Any, first: np.ndarray, fps: float) -> Any:
-    height, width = (edge + edge % 2 for edge in first.shape[:2])
-    rate = Fraction(fps).limit_denominator(1000)
-    options = {"crf": str(QUALITY), "preset": "medium", "profile": "high"}
-    stream = container.add_stream(ENCODER, rate=rate, options=options)
-    settings = {
-        "width": width,
-        "height": height,
-        "pix_fmt": "yuv420p",
-        "time_base": 1 / rate,
-        "colorspace": _MATRIX,
-        "color_primaries": _PRIMARIES,
-        "color_trc": _TRANSFER,
-        "color_range": _LIMITED,
-        "thread_count": 1,
-    }
-    for name, value in settings.items():
-        setattr(stream.codec_context, name, value)
-    return stream
-
-
 def yuv_planes(image: np.ndarray) -> np.ndarray:
     """Return the planes Y, U, V of 4:2:0 (ITU-R BT.601), as OpenCV and FFmpeg lay them out.
 
-    Args:
-        image: (H, W, 3) uint8 sRGB; an odd row or column at the end is doubled.
-
-    Returns:
-        (3 / 2 H, W) uint8.
+    Of an image (H, W, 3), whose odd row or column at the end is doubled: (3 / 2 H, W) uint8.
     """
     import cv2
 
     rows, columns = image.shape[0] % 2, image.shape[1] % 2
     even = np.pad(image, ((0, rows), (0, columns), (0, 0)), mode="edge")
     return np.asarray(cv2.cvtColor(even, cv2.COLOR_RGB2YUV_I420))
-
-
-def _library() -> ModuleType:
-    try:
-        import av
-
-        av.codec.Codec(ENCODER, "w")
-    except (ImportError, ValueError) as error:
-        raise MissingDependency(
-            "nothing here can encode H.264, which videos are written in",
-            remedy="Install PyAV: pip install av",
-        ) from error
-    library: ModuleType = av
-    return library

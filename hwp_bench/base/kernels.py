@@ -157,7 +157,9 @@ class MachineCode:
 
     def on_disk(self) -> bool:
         """Whether the disk holds a version of this function, as far as can be told."""
-        return any(self._files(folder) for folder in _folders())
+        prefix = self._prefix()
+        places = [] if prefix is None else _folders()
+        return any(any(folder.glob(f"{prefix}-*{_SUFFIX}")) for folder in places)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Return the compiled version for a signature, or None."""
@@ -167,9 +169,9 @@ class MachineCode:
         target_context.refresh()
         for folder in _folders():
             with contextlib.suppress(Exception):  # another numba inside, or a class that is gone
-                content = _read(folder / self._name(key))
-                if content is not None:
-                    stored, payload = pickle.loads(content)
+                raw = read_private(folder / self._name(key), MAX_BYTES)
+                if raw is not None and hashlib.sha256(raw[32:]).digest() == raw[:32]:
+                    stored, payload = pickle.loads(raw[32:])
                     if stored == (key, sig):
                         return CompileResult._rebuild(target_context, *payload)
         return None
@@ -205,10 +207,6 @@ class MachineCode:
     def _name(self, key: tuple[str, ...]) -> str:
         return f"{key[0]}-{_hex(key)}{_SUFFIX}"
 
-    def _files(self, folder: Path) -> list[Path]:
-        prefix = self._prefix()
-        return [] if prefix is None else sorted(folder.glob(f"{prefix}-*{_SUFFIX}"))
-
 
 @functools.cache
 def kernel_digest(module: str) -> str | None:
@@ -243,11 +241,8 @@ def kernel_modules(module: str, root: Path = PACKAGES) -> dict[str, Path]:
         found[name] = path
         for source, names in [] if name == __name__ else _imports(path.read_text("utf-8")):
             # A name is a module of a package, or stands in the file itself.
-            inner = [
-                f"{source}.{part.split()[0]}"
-                for part in names.strip("( \n").split(",")
-                if part.strip()
-            ]
+            parts = names.strip("( \n").split(",")
+            inner = [f"{source}.{part.split()[0]}" for part in parts if part.strip()]
             pending += [one if _file(one, root) else source for one in inner or [source]]
     return dict(sorted(found.items()))
 
@@ -270,14 +265,6 @@ def _folders() -> list[Path]:
     """Where machine code may lie: this user's cache, then one that is only read."""
     shared = os.environ.get(SHARED)
     return [code_folder(), *([Path(shared)] if shared else [])]
-
-
-def _read(path: Path) -> bytes | None:
-    """The content of a file that is whole and private."""
-    raw = read_private(path, MAX_BYTES)
-    if raw is None or hashlib.sha256(raw[32:]).digest() != raw[:32]:
-        return None
-    return raw[32:]
 
 
 @functools.cache

@@ -77,11 +77,13 @@ def share_processors() -> None:
 
 def check_thread_variables(environment: Mapping[str, str]) -> None:
     """Check what a person has set, which libraries ignore or end the process for."""
+    most = MOST_THREADS
     for name in dict.fromkeys((*TORCH_COUNTS, *BLAS_COUNTS, "NUMBA_NUM_THREADS")):
         text = environment.get(name, "").strip()
         # OpenMP takes a number for each depth of nested regions.
         numbers = text.split(",") if name == "OMP_NUM_THREADS" else [text]
-        if text and not all(_is_count(number.strip()) for number in numbers):
+        counts = [int(each) for each in numbers if _COUNT.fullmatch(each.strip())]
+        if text and (len(counts) < len(numbers) or not 1 <= min(counts) <= max(counts) <= most):
             raise UsageError(
                 f"is {text[:40]!r}, not a number of threads from 1 to {MOST_THREADS}",
                 field=name,
@@ -94,10 +96,6 @@ def check_thread_variables(environment: Mapping[str, str]) -> None:
             field="OMP_WAIT_POLICY",
             remedy="Correct the environment variable, or unset it.",
         )
-
-
-def _is_count(text: str) -> bool:
-    return _COUNT.fullmatch(text) is not None and 1 <= int(text) <= MOST_THREADS
 
 
 def count_is_chosen(environment: Mapping[str, str]) -> bool:
@@ -168,8 +166,7 @@ def _library() -> Any:
         return None
     import ctypes
 
-    names = (None, "libm.so.6", "libm.dylib")
-    for name in names:
+    for name in (None, "libm.so.6", "libm.dylib"):
         try:
             library: Any = ctypes.CDLL(name)
             for function in (library.fegetenv, library.fesetenv):

@@ -166,12 +166,7 @@ def library() -> Library | None:
 
 
 class EmbreeMesh:
-    """One mesh, built where it is.
-
-    Args:
-        vertices: (V, 3) m.
-        faces: (F, 3) vertex indices.
-    """
+    """One mesh, built where it is: vertices (V, 3) m and faces (F, 3)."""
 
     def __init__(self, loaded: Library, vertices: np.ndarray, faces: np.ndarray) -> None:
         self._library, call = loaded, loaded.call
@@ -195,7 +190,9 @@ class EmbreeMesh:
             )
         call("rtcCommitGeometry", self._geometry)
         call("rtcAttachGeometry", self._scene, self._geometry)
-        self._commit()
+        call("rtcCommitScene", self._scene)
+        if error := call("rtcGetDeviceError", loaded.device):
+            raise HwpError(f"Embree cannot build a mesh of {len(self._faces)} faces ({error})")
 
     def first_hits(self, origins: np.ndarray, directions: np.ndarray) -> Met:
         """The first face on each ray.
@@ -205,20 +202,21 @@ class EmbreeMesh:
             directions: (N, 3), any length.
         """
         rays = _rays(origins, directions)
-        ray, face = _cast(self._library.intersect, self._scene, *rays)
-        places = places_on_faces(self._vertices, self._faces, *rays, ray, face)
-        return ray, face, *places
+        met = self._meet(*rays)
+        ray = np.flatnonzero(met >= 0)
+        face = met[ray].astype(np.int64)
+        return ray, face, *places_on_faces(self._vertices, self._faces, *rays, ray, face)
 
     def blocked(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Whether anything is in each ray's way: (N,) bool; arguments as of `first_hits`."""
-        rays = _rays(origins, directions)
-        return _ask(self._library.occluded, self._scene, *rays)
+        return self._meet(*_rays(origins, directions), anything=True) >= 0
 
-    def _commit(self) -> None:
-        self._library.call("rtcCommitScene", self._scene)
-        error = self._library.call("rtcGetDeviceError", self._library.device)
-        if error:
-            raise HwpError(f"Embree cannot build a mesh of {len(self._faces)} faces ({error})")
+    def _meet(
+        self, origins: np.ndarray, directions: np.ndarray, *, anything: bool = False
+    ) -> np.ndarray:
+        """(N,) the first face on each ray, or any number above -1; -1 where nothing is."""
+        call = self._library.occluded if anything else self._library.intersect
+        return _cast(call, self._scene, origins, directions)
 
 
 def _rays(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -244,84 +242,45 @@ def _aim(ray: np.ndarray, numbers: np.ndarray, origin: np.ndarray, direction: np
 
 
 @compiled(nogil=True)
-def _cast(
-    call: Any, scene: int, origins: np.ndarray, directions: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Which rays meet something, and the face that each of them meets."""
+def _cast(call: Any, scene: int, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """See `EmbreeMesh._meet`. Where it is only asked whether something is met, 0 stands for it."""
     ray = _new_ray()
     numbers = ray.view(np.int32)
     place = np.int64(ray.ctypes.data)
-    count = len(directions)
-    index, face = np.empty(count, np.int64), np.empty(count, np.int64)
-    several = len(origins) > 1
-    hits = 0
-    for i in range(count):
-        _aim(ray, numbers, origins[i if several else 0], directions[i])
-        call(scene, place, 0)
-        if numbers[17] >= 0:
-            index[hits], face[hits] = i, numbers[17]
-            hits += 1
-    return index[:hits], face[:hits]
-
-
-@compiled(nogil=True)
-def _ask(call: Any, scene: int, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    ray = _new_ray()
-    numbers = ray.view(np.int32)
-    place = np.int64(ray.ctypes.data)
-    met = np.empty(len(directions), np.bool_)
+    met = np.empty(len(directions), np.int64)
     several = len(origins) > 1
     for i in range(len(directions)):
         _aim(ray, numbers, origins[i if several else 0], directions[i])
         call(scene, place, 0)
-        met[i] = ray[8] < 0.0
+        # `rtcOccluded1` writes no face, but a negative end of the ray.
+        met[i] = 0 if ray[8] < 0.0 else numbers[17]
     return met
 
 
-def ray_mesh(vertices: np.ndarray, faces: np.ndarray) -> EmbreeMesh | EmbreexMesh:
-    """Make a mesh ready to be asked what rays meet.
-
-    Args:
-        vertices: (V, 3) m.
-        faces: (F, 3) vertex indices.
-    """
+def ray_mesh(vertices: np.ndarray, faces: np.ndarray) -> EmbreeMesh:
+    """Make a mesh, vertices (V, 3) m and faces (F, 3), ready to be asked what rays meet."""
     loaded = library()
     return EmbreexMesh(vertices, faces) if loaded is None else EmbreeMesh(loaded, vertices, faces)
 
 
-class EmbreexMesh:
-    """What `EmbreeMesh` does, through the package embreex alone: slower, the same hits.
-
-    Args:
-        vertices: (V, 3) m.
-        faces: (F, 3) vertex indices.
-    """
+class EmbreexMesh(EmbreeMesh):
+    """The same through the package embreex alone: slower, the same hits."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
 
-        self._scene = EmbreeScene()
+        self._embreex = EmbreeScene()
         self._vertices = np.ascontiguousarray(vertices, dtype=np.float32)
         self._faces = np.ascontiguousarray(faces, dtype=np.int32)
-        self._mesh = TriangleMesh(self._scene, self._vertices, self._faces)
+        self._mesh = TriangleMesh(self._embreex, self._vertices, self._faces)
 
-    def first_hits(self, origins: np.ndarray, directions: np.ndarray) -> Met:
-        """The first face on each ray: (ray, face, u, v, distance), each (H,)."""
-        rays = _single_rays(origins, directions)
-        met = self._scene.run(*rays, output=False)
-        ray = np.flatnonzero(met >= 0)
-        face = met[ray].astype(np.int64)
-        return ray, face, *places_on_faces(self._vertices, self._faces, *rays, ray, face)
-
-    def blocked(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Whether anything is in each ray's way: (N,) bool."""
+    def _meet(
+        self, origins: np.ndarray, directions: np.ndarray, *, anything: bool = False
+    ) -> np.ndarray:
         if not len(directions):
-            return np.zeros(0, dtype=bool)
-        found = self._scene.run(*_single_rays(origins, directions), query="OCCLUDED")
-        return np.asarray(found) >= 0
-
-
-def _single_rays(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    starts = np.broadcast_to(origins, directions.shape)
-    return tuple(np.ascontiguousarray(rays, np.float32) for rays in (starts, directions))  # type: ignore[return-value]
+            return np.zeros(0, dtype=np.int64)
+        starts = np.broadcast_to(origins, directions.shape)
+        rays = (np.ascontiguousarray(each, np.float32) for each in (starts, directions))
+        query = "OCCLUDED" if anything else "INTERSECT"
+        return np.asarray(self._embreex.run(*rays, query=query, output=False))

@@ -19,11 +19,7 @@ float, NaN and infinity are refused, and so is text with control characters. Bou
 `msgspec.Meta` in an `Annotated` type, or the metadata of `number` and `choice`. A pattern in a
 `Meta` needs a `description`, which messages show, and must exclude control characters itself.
 
-A missing field takes its default, so that a format may get additional fields. A field that was
-taken out of a format stays readable when the class lists it::
-
-    removed_fields: ClassVar[tuple[str, ...]] = ("loss",)
-
+A missing field takes its default, so that a format may get additional fields.
 What no type can say belongs in `__post_init__`, which raises `UsageError(problem, field=name)`;
 the reader adds the file and the path.
 
@@ -60,7 +56,7 @@ from hwp_bench.base.errors import (
     nearest,
     shown,
 )
-from hwp_bench.base.files import MAX_JSON_INTEGER
+from hwp_bench.base.files import MAX_JSON_INTEGER, inner_values
 
 # Longest piece of a name or value that a message repeats.
 _SHOWN = 100
@@ -94,17 +90,13 @@ def strict_twin(kind: type, rules: Rules) -> type[msgspec.Struct]:
             fields.append((item.name, Union[strict, msgspec.UnsetType], UNSET))  # noqa: UP007
         else:
             fields.append((item.name, strict))
-    removed = [(name, Any, UNSET) for name in getattr(kind, "removed_fields", ())]
+    free = [item.name for item in dataclasses.fields(kind) if _free(hints[item.name])]
     return msgspec.defstruct(
         kind.__name__,
-        [*fields, *removed],
+        fields,
         kw_only=True,
         forbid_unknown_fields=not rules.ignore_unknown,
-        namespace={
-            "__record__": kind,
-            "__removed__": getattr(kind, "removed_fields", ()),
-            "__free__": [item.name for item in dataclasses.fields(kind) if _free(hints[item.name])],
-        },
+        namespace={"__record__": kind, "__free__": free},
     )
 
 
@@ -125,8 +117,7 @@ def _strict(hint: Any, metadata: Mapping[str, Any], rules: Rules) -> Any:
     elif dataclasses.is_dataclass(hint):
         strict = strict_twin(typing.cast("type", hint), rules)
     elif hint in (int, float):
-        metas = tuple(_without_denormals(meta) for meta in metas)
-        metas = (*metas, *_bounds(hint, metas, metadata.get("range", (rules.low, rules.high))))
+        metas = (_bounds(hint, metas, metadata.get("range", (rules.low, rules.high))),)
         strict = hint
     elif hint is str:
         if not any(isinstance(meta, Meta) and meta.pattern for meta in metas):
@@ -146,33 +137,24 @@ def _strict(hint: Any, metadata: Mapping[str, Any], rules: Rules) -> Any:
     return Annotated[(strict, *metas)] if metas else strict
 
 
-def _without_denormals(meta: Any) -> Any:
-    """The same bounds where denormals are flushed to zero.
-
-    `msgspec` takes "above 0" for "at least the smallest float". That is a denormal, which is equal
-    to 0 where they are flushed, so that 0 would pass.
-    """
-    changed: dict[str, Any] = {}
-    if isinstance(meta.gt, float) and meta.gt == 0.0:
-        changed |= {"gt": None, "ge": _LEAST}
-    if isinstance(meta.lt, float) and meta.lt == 0.0:
-        changed |= {"lt": None, "le": -_LEAST}
-    if not changed:
-        return meta
-    names = ("gt", "ge", "lt", "le", "description")
-    return Meta(**{name: getattr(meta, name) for name in names} | changed)
-
-
-def _bounds(kind: type, metas: tuple[Any, ...], limits: tuple[float, float]) -> Iterator[Meta]:
-    # The largest float keeps infinity out, and NaN is above no bound.
+def _bounds(kind: type, metas: tuple[Any, ...], limits: tuple[float, float]) -> Meta:
+    """The bounds of a number: its own, or else the limits; every float is finite."""
     own = _limits(metas)
     low, high = (-math.inf, math.inf) if own else limits
     if kind is float:
+        # The largest float keeps infinity out, and NaN is above no bound.
         low, high = max(low, -_LARGEST), min(high, _LARGEST)
+        # `msgspec` takes "above 0" for "at least the smallest float". That is a denormal, which is
+        # equal to 0 where they are flushed, so that 0 would pass.
+        if own.get("gt") == 0.0:
+            own = {name: own[name] for name in own if name != "gt"} | {"ge": _LEAST}
+        if own.get("lt") == 0.0:
+            own = {name: own[name] for name in own if name != "lt"} | {"le": -_LEAST}
     if math.isfinite(low) and not {"ge", "gt"} & own.keys():
-        yield Meta(ge=kind(low))
+        own["ge"] = kind(low)
     if math.isfinite(high) and not {"le", "lt"} & own.keys():
-        yield Meta(le=kind(high))
+        own["le"] = kind(high)
+    return Meta(**own)
 
 
 def _limits(metas: Iterable[Any]) -> dict[str, Any]:
@@ -265,11 +247,10 @@ def _expected(kind: Any, metas: tuple[Any, ...]) -> str:
         size = f"at least {least:,}" if most is None else f"{least:,} to {most:,}"
         return f"{words[origin or kind]} of {size} {'characters' if kind is str else 'entries'}"
     sides = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
-    limits = {name: value for name, value in rules.items() if abs(value) < _LARGEST}
-    if limits.get("ge") == _LEAST:
-        limits = {"gt": 0.0} | {name: limits[name] for name in limits if name != "ge"}
-    if limits.get("le") == -_LEAST:
-        limits = {name: limits[name] for name in limits if name != "le"} | {"lt": 0.0}
+    # What `_bounds` has for 0 and for every float are no words.
+    strict = {("ge", _LEAST): ("gt", 0.0), ("le", -_LEAST): ("lt", 0.0)}
+    found = (strict.get(item, item) for item in rules.items() if abs(item[1]) < _LARGEST)
+    limits: dict[str, float] = dict(found)
     if {"ge", "le"} == limits.keys():
         return f"{words[kind]} from {limits['ge']:g} to {limits['le']:g}"
     bounds = " and ".join(f"{sides[name]} {value:g}" for name, value in limits.items())
@@ -277,7 +258,7 @@ def _expected(kind: Any, metas: tuple[Any, ...]) -> str:
 
 
 def _remedy(name: str, path: str, kind: type[msgspec.Struct]) -> str:
-    known = [n for n in kind.__struct_fields__ if n not in kind.__removed__]  # type: ignore[attr-defined]
+    known = kind.__struct_fields__
     close = nearest(name, known)
     return f"Did you mean {join(path, close[0])!r}?" if close else f"Known: {', '.join(known)}."
 
@@ -366,8 +347,7 @@ def parse_record(
             return type(item)(build(part, f"{path}[{i}]") for i, part in enumerate(item))
         if not isinstance(item, msgspec.Struct):
             return item
-        names = set(item.__struct_fields__) - set(item.__removed__)  # type: ignore[attr-defined]
-        given = {name: getattr(item, name) for name in names}
+        given = {name: getattr(item, name) for name in item.__struct_fields__}
         for name in item.__free__:  # type: ignore[attr-defined]
             if given[name] is not UNSET:
                 place = join(path, name)
@@ -514,29 +494,13 @@ def parse_toml(
         raise refuse("is nested too deeply")
     try:
         content = tomllib.loads(text)
+        items = list(inner_values(content, MAX_TOML_DEPTH))
     except RecursionError as fault:
         raise refuse("is nested too deeply") from fault
     except tomllib.TOMLDecodeError as fault:
         raise refuse(f"is not valid TOML ({str(fault)[:300]})") from fault
     except ValueError as fault:  # Python converts no integer of more than 4,300 digits
         raise refuse("holds an absurdly large number") from fault
-    if problem := _excess(content):
-        raise refuse(problem)
+    if any(isinstance(item, int) and item.bit_length() > MAX_BITS for item in items):
+        raise refuse("holds an absurdly large number")
     return content
-
-
-def _excess(content: Any) -> str | None:
-    """Say what of parsed TOML is out of bounds; level by level, because it may be deep."""
-    level = [content]
-    for _ in range(MAX_TOML_DEPTH):
-        below = []
-        for holder in level:
-            for item in holder.values() if isinstance(holder, dict) else holder:
-                if isinstance(item, dict | list):
-                    below.append(item)
-                elif isinstance(item, int) and item.bit_length() > MAX_BITS:
-                    return "holds an absurdly large number"
-        if not below:
-            return None
-        level = below
-    return "is nested too deeply"

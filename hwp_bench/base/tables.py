@@ -7,7 +7,6 @@ import io
 import json
 import shutil
 import sys
-import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -80,6 +79,10 @@ class Table:
         stop = min(edge for edge in edges if edge > row)
         return [index for index in range(start, stop) if index not in self.unranked]
 
+    def counts(self, column: int) -> bool:
+        """Whether a column holds numbers, which stand to the right."""
+        return any(isinstance(cells[column], int | float) for cells in self.rows)
+
     def text(self, row: int, column: int) -> str:
         """Return a cell as it is printed."""
         value = self.rows[row][column]
@@ -113,11 +116,8 @@ class Table:
 
 def without_empty_columns(table: Table) -> Table:
     """Return the table without the columns in which no row has anything."""
-    kept = [
-        index
-        for index in range(len(table.columns))
-        if any(cells[index] is not None for cells in table.rows)
-    ]
+    every = range(len(table.columns))
+    kept = [index for index in every if any(cells[index] is not None for cells in table.rows)]
     return replace(
         table,
         columns=tuple(table.columns[index] for index in kept),
@@ -140,12 +140,9 @@ def to_markdown(table: Table) -> str:
         return before + _markdown_text(table.text(row, column)) + after
 
     heads = [_markdown_text((column.name + column.arrow).strip()) for column in table.columns]
-    rules = [
-        "---:" if any(isinstance(cells[index], int | float) for cells in table.rows) else "---"
-        for index in range(len(table.columns))
-    ]
-    lines = [f"**{_markdown_text(table.caption)}**", "", _bar(heads), _bar(rules)]
     count = len(table.columns)
+    rules = ["---:" if table.counts(index) else "---" for index in range(count)]
+    lines = [f"**{_markdown_text(table.caption)}**", "", _bar(heads), _bar(rules)]
     lines += [_bar([cell(row, c) for c in range(count)]) for row in range(len(table.rows))]
     lines += [line for note in table.notes for line in ("", _markdown_text(note))]
     return "\n".join(lines) + "\n"
@@ -169,10 +166,7 @@ def to_latex(table: Table) -> str:
         return marks[table.rank(row, column)] % _latex_text(table.text(row, column))
 
     count = len(table.columns)
-    alignment = "".join(
-        "r" if any(isinstance(cells[index], int | float) for cells in table.rows) else "l"
-        for index in range(count)
-    )
+    alignment = "".join("r" if table.counts(index) else "l" for index in range(count))
     lines = [
         r"\begin{table}[t]",
         r"  \centering",
@@ -194,14 +188,9 @@ def to_latex(table: Table) -> str:
 def _latex_groups(table: Table) -> list[str]:
     if not any(column.group for column in table.columns):
         return []
-    spans: list[tuple[str, int]] = []
-    for column in table.columns:
-        if spans and spans[-1][0] == column.group:
-            spans[-1] = (column.group, spans[-1][1] + 1)
-        else:
-            spans.append((column.group, 1))
     cells, rules, first = [], [], 1
-    for group, width in spans:
+    for group, members in groupby(table.columns, key=lambda column: column.group):
+        width = len(list(members))
         cells.append(rf"\multicolumn{{{width}}}{{c}}{{{_latex_text(group)}}}")
         if group:
             rules.append(rf"\cmidrule(lr){{{first}-{first + width - 1}}}")
@@ -210,15 +199,8 @@ def _latex_groups(table: Table) -> list[str]:
 
 
 def _latex_text(text: str) -> str:
-    escapes = {
+    escapes = {char: f"\\{char}" for char in "&%$#_{}"} | {
         "\\": r"\textbackslash{}",
-        "&": r"\&",
-        "%": r"\%",
-        "$": r"\$",
-        "#": r"\#",
-        "_": r"\_",
-        "{": r"\{",
-        "}": r"\}",
         "~": r"\textasciitilde{}",
         "^": r"\textasciicircum{}",
         "↑": r"$\uparrow$",
@@ -337,10 +319,7 @@ class _Drawing:
             for row in range(len(table.rows))
         ]
         self.headings = [self.fit(column.heading) for column in table.columns]
-        self.numbers = [
-            any(isinstance(cells[index], int | float) for cells in table.rows)
-            for index in range(len(table.columns))
-        ]
+        self.numbers = [table.counts(index) for index in range(len(table.columns))]
         #: How many columns name a row: all before the first with a measurement.
         self.keys = 1
         for index, column in enumerate(table.columns):
@@ -396,6 +375,11 @@ class _Drawing:
         ]
         self.widths = natural
         everything = range(len(natural))
+        # The last column of a group makes room for the longest word of its name.
+        for group, run in groupby(everything, key=lambda i: self.table.columns[i].group):
+            members = list(run)
+            lacks = max(map(len, group.split()), default=0) - _total(natural, members)
+            natural[members[-1]] += max(lacks, 0)
         # Those that name rows are folded until all fits, or until they leave half to numbers.
         for limit in range(most, least - 1, -1):
             if _total(self.widths, everything) <= self.width:
@@ -419,10 +403,9 @@ class _Drawing:
         from rich.table import Table as RichTable
         from rich.text import Text
 
-        widths = self._spread(columns)
         rule = self.fit("─")
         if any(self.table.columns[index].group for index in columns):
-            yield self._groups(columns, widths, rule)
+            yield self._groups(columns, rule)
         lines = ["    "] * 8
         lines[2] = lines[4] = rule * 4
         box = Box("\n".join(lines), ascii=True)
@@ -432,25 +415,15 @@ class _Drawing:
         )
         for index in columns:
             heading = Text(self.headings[index], justify="right" if self.numbers[index] else "left")
-            grid.add_column(heading, width=widths[index], overflow="fold")
-        for row, cells in enumerate(self._rows(columns, widths)):
+            grid.add_column(heading, width=self.widths[index], overflow="fold")
+        for row, cells in enumerate(self._rows(columns)):
             if row in self.table.breaks:
                 grid.add_section()
             ranks = [self.table.rank(row, index) for index in columns]
             grid.add_row(*(Text(c, _STYLES[r]) for c, r in zip(cells, ranks, strict=True)))
         yield grid
 
-    def _spread(self, columns: Sequence[int]) -> list[int]:
-        """Widen the last column of each group whose name has a longer word, if there is room."""
-        widths = list(self.widths)
-        for group, run in groupby(columns, key=lambda i: self.table.columns[i].group):
-            members = list(run)
-            lacks = max(map(len, group.split()), default=0) - _total(widths, members)
-            if 0 < lacks <= self.width - _total(widths, columns):
-                widths[members[-1]] += lacks
-        return widths
-
-    def _groups(self, columns: Sequence[int], widths: Sequence[int], rule: str) -> Any:
+    def _groups(self, columns: Sequence[int], rule: str) -> Any:
         """The names of groups over a block, centred in a rule where there is room for one."""
         from rich.rule import Rule
         from rich.table import Table as RichTable
@@ -459,33 +432,27 @@ class _Drawing:
         line = RichTable.grid(padding=(0, _GAP, 0, 0))
         cells: list[Any] = []
         for group, run in groupby(columns, key=lambda i: self.table.columns[i].group):
-            name, span = self.fit(group), _total(widths, list(run))
+            name, span = self.fit(group), _total(self.widths, list(run))
             line.add_column(width=span, justify="center", vertical="bottom")
             ruled = name and len(name) + 4 <= span
             cells.append(Rule(name, characters=rule, style="bold") if ruled else Text(name, "bold"))
         line.add_row(*cells)
         return line
 
-    def _rows(self, columns: Sequence[int], widths: Sequence[int]) -> list[list[str]]:
+    def _rows(self, columns: Sequence[int]) -> list[list[str]]:
         """The cells of each row, numbers to the right.
 
-        Where blocks of rows begin with the same texts, a text stands once and flows down over the
-        rows that repeat it. The last column that names rows is always printed.
+        Where blocks of rows begin with the same texts, these stand in the first row alone. The last
+        column that names rows is always printed.
         """
         found = [
-            [c[i].rjust(widths[i]) if self.numbers[i] else c[i] for i in columns]
+            [c[i].rjust(self.widths[i]) if self.numbers[i] else c[i] for i in columns]
             for c in self.cells
         ]
-        edges = [*self.table.breaks, len(found)] if self.table.breaks else []
-        for place in range(self.keys - 1):
-            start = 0
-            for edge in edges:
-                block = range(start, edge)
-                for _, run in groupby(block, key=lambda row: self.cells[row][: place + 1]):
-                    rows = list(run)
-                    left = textwrap.wrap(found[rows[0]][place], widths[place])
-                    for row in rows:
-                        here = left if row == rows[-1] else left[:1]
-                        found[row][place], left = "\n".join(here), left[1:]
-                start = edge
+        named = self.keys - 1 if self.table.breaks else 0
+        for row in range(len(found) - 1, 0, -1):
+            above, own = self.cells[row - 1], self.cells[row]
+            for place in range(0 if row in self.table.breaks else named):
+                if own[: place + 1] == above[: place + 1]:
+                    found[row][place] = ""
         return found

@@ -123,7 +123,7 @@ class _Memo(dict[int, Any]):
 #: Python's own reader, whose every step can be changed.
 _Reader: Any = pickle._Unpickler
 #: The steps that are taken: those of files of plain data.
-_STEPS = (
+_NAMES = (
     "PROTO FRAME STOP MARK POP POP_MARK DUP MEMOIZE PUT BINPUT LONG_BINPUT GET BINGET LONG_BINGET "
     "NONE NEWTRUE NEWFALSE INT BININT BININT1 BININT2 LONG LONG1 LONG4 FLOAT BINFLOAT STRING "
     "BINSTRING SHORT_BINSTRING UNICODE BINUNICODE SHORT_BINUNICODE BINUNICODE8 BINBYTES "
@@ -131,6 +131,7 @@ _STEPS = (
     "APPEND APPENDS EMPTY_DICT DICT SETITEM SETITEMS GLOBAL STACK_GLOBAL REDUCE NEWOBJ BUILD "
     "PERSID BINPERSID"
 )
+_STEPS = frozenset(getattr(pickle, name)[0] for name in _NAMES.split())
 
 
 class _Unpickler(_Reader):
@@ -146,31 +147,22 @@ class _Unpickler(_Reader):
         self._classes: dict[str, type[StandIn]] = {}
 
     def __getitem__(self, code: int) -> Callable[[Any], None]:
-        """The function that takes the next step."""
+        """The function that takes the next step, where its objects are in order."""
         self._left -= 1
         if self._left < 0:
             raise ValueError(f"more than {self._most:,} steps")
-        if code not in _DISPATCH:
+        if code not in _STEPS:
             raise ValueError(f"step {bytes([code])!r} is not one of plain data")
-        return _DISPATCH[code]
-
-    def integer(self, load: Callable[[Any], None]) -> None:
-        """Take a step that makes an integer of any size."""
-        load(self)
-        if abs(self.stack[-1]) > _LARGEST_INTEGER:
+        if any(isinstance(one, int) and abs(one) > _LARGEST_INTEGER for one in self.stack[-1:]):
             raise ValueError("an absurdly large integer")
-
-    def entries(self, load: Callable[[Any], None], keys: list[Any]) -> None:
-        """Take a step that sets entries of a table."""
-        if any(not isinstance(key, str | bytes | int | float | None) for key in keys):
-            raise ValueError("a key of a table is neither a text nor a number")
-        load(self)
-
-    def state(self, load: Callable[[Any], None]) -> None:
-        """Take a step that gives an object its state."""
-        if not isinstance(self.stack[-2], StandIn | _Dtype | _Array):
+        if code in (pickle.SETITEM[0], pickle.SETITEMS[0], pickle.DICT[0]):
+            keys = self.stack[-2:-1] if code == pickle.SETITEM[0] else self.stack[::2]
+            if any(not isinstance(key, str | bytes | int | float | None) for key in keys):
+                raise ValueError("a key of a table is neither a text nor a number")
+        if code == pickle.BUILD[0] and not isinstance(self.stack[-2], StandIn | _Dtype | _Array):
             raise TypeError("a state of something that has none")
-        load(self)
+        taken: dict[int, Callable[[Any], None]] = _Reader.dispatch
+        return _Unpickler.byte_array if code == pickle.BYTEARRAY8[0] else taken[code]
 
     def byte_array(self) -> None:
         """Take a step that makes an array of bytes, whose room is made when they are there."""
@@ -181,7 +173,9 @@ class _Unpickler(_Reader):
         full = f"{module}.{name}"
         if full in _ADMITTED:
             return _ADMITTED[full]
-        if self._is_stand_in(module, full):
+        parents = module.split(".")
+        packages = {".".join(parents[: i + 1]) + ".*" for i in range(len(parents))}
+        if full in self._stand_ins or not packages.isdisjoint(self._stand_ins):
             if full not in self._classes:
                 self._classes[full] = type("StandIn", (StandIn,), {"origin": full})
             return self._classes[full]
@@ -196,33 +190,6 @@ class _Unpickler(_Reader):
         raise UnsafePickle(
             "this pickle refers to objects outside itself", where=self._path, field="persistent id"
         )
-
-    def _is_stand_in(self, module: str, full: str) -> bool:
-        parents = module.split(".")
-        packages = {".".join(parents[: i + 1]) + ".*" for i in range(len(parents))}
-        return full in self._stand_ins or not packages.isdisjoint(self._stand_ins)
-
-
-_CHECKED = ("BUILD", "SETITEM", "SETITEMS", "DICT")
-
-
-def _dispatch() -> dict[int, Callable[[Any], None]]:
-    """What takes each step."""
-    taken = {getattr(pickle, name)[0] for name in _STEPS.split()}
-    steps = {code: step for code, step in _Reader.dispatch.items() if code in taken}
-    for name in ("INT", "LONG", "LONG1", "LONG4"):
-        code = getattr(pickle, name)[0]
-        steps[code] = lambda reader, load=steps[code]: reader.integer(load)
-    build, one, many, table = (steps[getattr(pickle, name)[0]] for name in _CHECKED)
-    steps[pickle.BUILD[0]] = lambda reader: reader.state(build)
-    steps[pickle.SETITEM[0]] = lambda reader: reader.entries(one, reader.stack[-2:-1])
-    steps[pickle.SETITEMS[0]] = lambda reader: reader.entries(many, reader.stack[::2])
-    steps[pickle.DICT[0]] = lambda reader: reader.entries(table, reader.stack[::2])
-    steps[pickle.BYTEARRAY8[0]] = _Unpickler.byte_array
-    return steps
-
-
-_DISPATCH = _dispatch()
 
 
 # What has parts.
@@ -272,16 +239,6 @@ def _leaf(item: Any) -> int:
     return len(item) if isinstance(item, str | bytes | bytearray) else 1
 
 
-class _Function:
-    """A function that a pickle may call but not change: it takes no state."""
-
-    def __init__(self, function: Callable[..., Any]) -> None:
-        self._function = function
-
-    def __call__(self, *arguments: Any) -> Any:
-        return self._function(*arguments)
-
-
 class _Dtype:
     """An element type as a pickle describes it, checked before numpy sees it."""
 
@@ -322,7 +279,7 @@ class _Array(np.ndarray):
         super().__setstate__(whole)  # type: ignore[arg-type]
 
 
-def _bytes_of(raw: Any) -> bytes:
+def _bytes_of(raw: Any = b"") -> bytes:
     # Nothing but bytes: an integer would make that many zeros.
     if not isinstance(raw, (bytes, bytearray)):
         raise TypeError(f"{type(raw).__name__} where bytes are expected")
@@ -342,12 +299,16 @@ def _plain_dtype(holder: Any) -> np.dtype[Any]:
     return holder.dtype
 
 
-def _refuse_call(*arguments: Any) -> Any:
+def _ndarray(*arguments: Any) -> Any:
+    raise TypeError("this class is only named in pickles, never called")
+
+
+def _object(*arguments: Any) -> Any:
     raise TypeError("this class is only named in pickles, never called")
 
 
 def _reconstruct(subtype: Any, shape: Any, typecode: Any) -> np.ndarray:
-    if subtype is not _NDARRAY:
+    if subtype is not _ndarray:
         raise TypeError("an array of a foreign class")
     return np.ndarray.__new__(_Array, (0,), np.int8)
 
@@ -369,40 +330,33 @@ def _encode(text: Any, codec: Any = "latin1") -> bytes:
     return text.encode("latin1")
 
 
-def _bytes(raw: Any = b"") -> bytes:
-    return _bytes_of(raw)
-
-
 def _bytearray(raw: Any = b"", codec: Any = "latin1") -> bytearray:
     return bytearray(_encode(raw, codec) if isinstance(raw, str) else _bytes_of(raw))
 
 
 def _object_reconstructor(made: Any, base: Any, state: Any) -> Any:
-    if not (isinstance(made, type) and issubclass(made, StandIn) and base is _OBJECT):
+    if not (isinstance(made, type) and issubclass(made, StandIn) and base is _object):
         raise TypeError("an object of a class that is not admitted")
     return made()
 
 
-_NDARRAY = _Function(_refuse_call)
-_OBJECT = _Function(_refuse_call)
-
-
 def _admitted() -> dict[str, Any]:
+    """What a pickle may name, and what it gets: functions that take no state."""
     names: dict[str, Any] = {
-        "numpy.ndarray": _NDARRAY,
+        "numpy.ndarray": _ndarray,
         "numpy.dtype": _Dtype,
-        "_codecs.encode": _Function(_encode),
+        "_codecs.encode": _encode,
     }
     for core in ("numpy.core", "numpy._core"):  # the name changed in numpy 2
-        names[f"{core}.multiarray._reconstruct"] = _Function(_reconstruct)
-        names[f"{core}.multiarray.scalar"] = _Function(_scalar)
-        names[f"{core}.numeric._frombuffer"] = _Function(_from_buffer)
+        names[f"{core}.multiarray._reconstruct"] = _reconstruct
+        names[f"{core}.multiarray.scalar"] = _scalar
+        names[f"{core}.numeric._frombuffer"] = _from_buffer
     for builtins in ("builtins", "__builtin__"):  # Python 3 and 2
-        names[f"{builtins}.bytes"] = _Function(_bytes)
-        names[f"{builtins}.bytearray"] = _Function(_bytearray)
-        names[f"{builtins}.object"] = _OBJECT
+        names[f"{builtins}.bytes"] = _bytes_of
+        names[f"{builtins}.bytearray"] = _bytearray
+        names[f"{builtins}.object"] = _object
     for copyreg in ("copyreg", "copy_reg"):
-        names[f"{copyreg}._reconstructor"] = _Function(_object_reconstructor)
+        names[f"{copyreg}._reconstructor"] = _object_reconstructor
     return names
 
 

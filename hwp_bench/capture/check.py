@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from hwp_bench.base.arrays import evenly
@@ -27,8 +27,10 @@ from hwp_bench.capture.schema import (
     arrays_digest,
     hand_arrays,
     image_path,
+    numbers_digests,
 )
 from hwp_bench.capture.writer import combine
+from hwp_bench.hands.raster import draw_bones
 from hwp_bench.hands.template import HandTemplate
 from hwp_bench.taxonomy import perturbation
 
@@ -39,38 +41,27 @@ def refuse_changed(capture: Capture, kinds: Iterable[str] = ("frames", "masks"))
     A score stands under the digest of its capture, so that the pixels behind it must be those.
     Every image of the kinds is decoded: about 2 ms for a frame of 256 x 256 px.
     """
-    found = {
-        "hands": arrays_digest(hand_arrays(capture.hands)),
-        "cameras": arrays_digest({"Ks": capture.cameras.Ks, "viewmats": capture.cameras.viewmats}),
-        **{kind: images_digest(capture, kind) for kind in kinds},
-    }
-    stored = capture.info.digests or {}
+    found = numbers_digests(capture.hands, capture.cameras)
+    for kind in kinds:
+        with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+            images = pool.map(partial(capture.image, kind), range(len(capture)))
+            found[kind] = combine(map(pixel_digest, images))
     for part, digest in found.items():
-        if stored.get(part) != digest:
-            raise BadCapture(
-                "does not match the content" if part in stored else "is missing",
-                where=capture.root / METADATA,
-                field=f"digests.{part}",
-                remedy="The content was changed after the capture was written; get it again.",
-            )
+        if error := _changed(capture, part, digest):
+            raise error
 
 
-def images_digest(capture: Capture, kind: str) -> str:
-    """Return the digest over the decoded images of one kind."""
-    read = image_reader(capture, kind)
-    with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
-        return combine(pool.map(lambda frame: pixel_digest(read(frame)), range(len(capture))))
-
-
-def image_reader(capture: Capture, kind: str) -> Callable[[int], np.ndarray]:
-    """Return the function that reads one image of a kind, a key of `IMAGE_FOLDERS`, by frame."""
-    return {
-        "frames": capture.frame,
-        "masks": capture.mask,
-        "clean": capture.clean,
-        "true_masks": capture.true_mask,
-        "clean_masks": capture.clean_mask,
-    }[kind]
+def _changed(capture: Capture, part: str, digest: str) -> BadCapture | None:
+    """What is wrong with the digest that a capture states of a part; None if it is the part's."""
+    stored = (capture.info.digests or {}).get(part)
+    if stored == digest:
+        return None
+    return BadCapture(
+        "does not match the content" if stored else "is missing",
+        where=capture.root / METADATA,
+        field=f"digests.{part}",
+        remedy="The content was changed after the capture was written; get it again.",
+    )
 
 
 #: A visible hand smaller than this share of the frame is reported.
@@ -125,26 +116,42 @@ def check_capture(path: str | os.PathLike[str]) -> CheckReport:
         capture = open_capture(path)
     except HwpError as error:
         return CheckReport(os.fspath(path), {}, (_finding(error),))
+    clip: Capture | None = None
     findings = [
         *_import(capture),
         *_valid(capture),
-        *_images(capture),
+        *(one for kind in IMAGE_FOLDERS for one in _images(capture, kind)),
         *_geometry(capture),
         *_templates(capture),
         *_numbers(capture),
         *_missing_truth(capture),
-        *_free_view(capture),
     ]
+    try:
+        clip = capture.free_view
+    except HwpError as error:
+        findings.append(_finding(error))
+    if clip is not None:
+        # The free-view clip is a capture of its own.
+        findings += check_capture(clip.root).findings
     findings.sort(key=lambda finding: finding.level)
-    return CheckReport(os.fspath(path), _facts(capture), tuple(findings))
+    return CheckReport(os.fspath(path), _facts(capture, clip), tuple(findings))
 
 
 def _finding(error: HwpError) -> Finding:
     return Finding("error", error.where or "", error.field, error.problem, error.remedy)
 
 
-def _facts(capture: Capture) -> dict[str, Any]:
+def _warning(where: Path, field: str | None, problem: str, remedy: str) -> Finding:
+    return Finding("warning", os.fspath(where), field, problem, remedy)
+
+
+def _facts(capture: Capture, clip: Capture | None) -> dict[str, Any]:
     info = capture.info
+    truth = {
+        "clean frames": capture.has_clean,
+        "exact masks": capture.has_true_masks,
+        "hand parameters": capture.true_hands is not None,
+    }
     return {
         "id": info.id,
         "hands": info.hands,
@@ -157,16 +164,8 @@ def _facts(capture: Capture) -> dict[str, Any]:
         "made_by": info.made_by or "not stated",
         "perturbed_frames": _perturbed_frames(info),
         "valid_frames": {side: int(hand.valid.sum()) for side, hand in capture.hands.items()},
-        "truth": [
-            name
-            for name, present in (
-                ("clean frames", capture.has_clean),
-                ("exact masks", capture.has_true_masks),
-                ("hand parameters", capture.true_hands is not None),
-            )
-            if present
-        ],
-        "free_view_frames": _count(capture),
+        "truth": [name for name, present in truth.items() if present],
+        "free_view_frames": 0 if clip is None else len(clip),
         "licence": info.licence,
         "digest": capture.digest,
     }
@@ -185,114 +184,71 @@ def _perturbed_frames(info: CaptureInfo) -> dict[str, int | None] | None:
     }
 
 
-def _count(capture: Capture) -> int:
-    """Frames of the free-view clip; 0 where there is none that can be opened."""
-    try:
-        return 0 if capture.free_view is None else len(capture.free_view)
-    except HwpError:  # reported as a finding
-        return 0
-
-
-def _free_view(capture: Capture) -> tuple[Finding, ...]:
-    """Everything about the clip, which is a capture of its own."""
-    try:
-        clip = capture.free_view
-    except HwpError as error:
-        return (_finding(error),)
-    return () if clip is None else check_capture(clip.root).findings
-
-
 def _import(capture: Capture) -> Iterator[Finding]:
     """Warnings of the importer of a video, as its record keeps them."""
     record = capture.info.source.get("fit")
     warnings = record.get("warnings") if isinstance(record, dict) else None
+    remedy = "Look at extra/overlay.png; correct the landmarks and import again."
     for warning in warnings[:MOST_WARNINGS] if isinstance(warnings, list) else ():
-        yield Finding(
-            "warning",
-            os.fspath(capture.root / METADATA),
-            "source.fit.warnings",
-            shown(str(warning))[:MAX_TEXT],
-            "Look at extra/overlay.png; correct the landmarks and import again.",
-        )
+        said = shown(str(warning))[:MAX_TEXT]
+        yield _warning(capture.root / METADATA, "source.fit.warnings", said, remedy)
 
 
 def _valid(capture: Capture) -> Iterator[Finding]:
     """Hands whose parameters are valid in few frames, or in none."""
-    where = os.fspath(capture.root / HANDS)
+    where = capture.root / HANDS
     counts = {side: int(hand.valid.sum()) for side, hand in capture.hands.items()}
     for side, count in counts.items():
-        said = f"the {side} hand is valid in {count} of {len(capture)} frames"
+        said, field = (
+            f"the {side} hand is valid in {count} of {len(capture)} frames",
+            f"{side}_valid",
+        )
         if not any(counts.values()):
-            yield Finding("error", where, f"{side}_valid", said, "There is nothing to be fitted.")
+            remedy = "There is nothing to be fitted."
+            yield Finding("error", os.fspath(where), field, said, remedy)
         elif count < FEW_VALID * len(capture):
             remedy = "Only they are fitted; look whether they follow the hand."
-            yield Finding("warning", where, f"{side}_valid", said, remedy)
+            yield _warning(where, field, said, remedy)
 
 
-def _images(capture: Capture) -> Iterator[Finding]:
-    for kind in IMAGE_FOLDERS:
-        folder = capture.root / IMAGE_FOLDERS[kind]
-        if kind not in ("frames", "masks") and not folder.is_dir():
-            continue
-        yield from _one_kind(capture, kind, folder)
-
-
-def _one_kind(capture: Capture, kind: str, folder: Path) -> Iterator[Finding]:
-    read = image_reader(capture, kind)
+def _images(capture: Capture, kind: str) -> Iterator[Finding]:
+    """Images of one kind, a key of `IMAGE_FOLDERS`, that cannot be read or show nothing."""
+    folder = capture.root / IMAGE_FOLDERS[kind]
+    if kind not in ("frames", "masks") and not folder.is_dir():
+        return
 
     def inspect(frame: int) -> tuple[str | None, Finding | None]:
         try:
-            pixels = read(frame)
+            pixels = capture.image(kind, frame)
         except HwpError as error:
             return None, _finding(error)
-        finding = None
+        file, finding = image_path(capture.root, kind, frame), None
         if kind == "masks" and (pixels > 127).mean() < SMALL_HAND:
-            finding = Finding(
-                "warning",
-                os.fspath(image_path(capture.root, kind, frame)),
-                None,
-                f"covers {100 * (pixels > 127).mean():.2f} % of the frame",
-                "A frame without a visible hand teaches a method nothing.",
-            )
+            said = f"covers {100 * (pixels > 127).mean():.2f} % of the frame"
+            remedy = "A frame without a visible hand teaches a method nothing."
+            finding = _warning(file, None, said, remedy)
         if kind == "frames" and is_blank(pixels):
-            finding = Finding(
-                "warning",
-                os.fspath(image_path(capture.root, kind, frame)),
-                None,
-                f"is of one colour (mean level {pixels.mean():.0f})",
-                "It shows no hand; leave such frames out of the capture.",
-            )
+            said = f"is of one colour (mean level {pixels.mean():.0f})"
+            remedy = "It shows no hand; leave such frames out of the capture."
+            finding = _warning(file, None, said, remedy)
         return pixel_digest(pixels), finding
 
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
         results = list(pool.map(inspect, range(len(capture))))
     yield from (finding for _, finding in results if finding is not None)
     known = {image_path(capture.root, kind, frame).name for frame in range(len(capture))}
-    present = {item.name for item in folder.iterdir()} if folder.is_dir() else set()
-    others = sorted(present - known)
+    others = sorted({item.name for item in folder.iterdir()} - known) if folder.is_dir() else []
     if others:
-        yield Finding(
-            "warning",
-            os.fspath(folder),
-            None,
-            f"holds {len(others)} further files: {shown(bounded(others))}",
-            "They are ignored.",
-        )
-    digests = [digest for digest, _ in results]
-    if all(digests):
-        yield from _compare(capture, kind, combine(digest for digest in digests if digest))
+        said = f"holds {len(others)} further files: {shown(bounded(others))}"
+        yield _warning(folder, None, said, "They are ignored.")
+    digests = [digest for digest, _ in results if digest]
+    if len(digests) == len(results):
+        yield from _compare(capture, kind, combine(digests))
 
 
 def _compare(capture: Capture, part: str, digest: str) -> Iterator[Finding]:
-    stored = (capture.info.digests or {}).get(part)
-    if stored != digest:
-        yield Finding(
-            "error",
-            os.fspath(capture.root / "capture.json"),
-            f"digests.{part}",
-            "does not match the content" if stored else "is missing",
-            "The content was changed after the capture was written; get it again.",
-        )
+    if error := _changed(capture, part, digest):
+        yield _finding(error)
 
 
 def _geometry(capture: Capture) -> Iterator[Finding]:
@@ -303,7 +259,7 @@ def _geometry(capture: Capture) -> Iterator[Finding]:
         if len(behind):
             yield Finding(
                 "error",
-                os.fspath(capture.root / "hands.npz"),
+                os.fspath(capture.root / HANDS),
                 f"{side}_transl",
                 f"the hand lies behind the camera in {len(behind)} of {len(hand.valid)} frames: "
                 f"{bounded(behind.tolist())}",
@@ -324,14 +280,10 @@ def _templates(capture: Capture) -> Iterator[Finding]:
             # Nothing of the capture is wrong, but no method here takes it.
             yield replace(_finding(error), level="warning")
             return
+        remedy = "Projections and renderings of it can be wrong; get the hand model again."
         for problem in mesh_problems(template):
-            yield Finding(
-                "warning",
-                os.fspath(capture.root / "capture.json"),
-                "hand_model",
-                f"the {side} template {problem}",
-                "Projections and renderings of it can be wrong; get the hand model again.",
-            )
+            said = f"the {side} template {problem}"
+            yield _warning(capture.root / METADATA, "hand_model", said, remedy)
 
 
 def mesh_problems(template: HandTemplate) -> list[str]:
@@ -361,26 +313,20 @@ def mesh_problems(template: HandTemplate) -> list[str]:
 def _missing_truth(capture: Capture) -> Iterator[Finding]:
     """Truth that the digests list and the folder lacks, as a copy without it does."""
     listed = capture.info.digests or {}
-    places = {kind: capture.root / folder for kind, folder in IMAGE_FOLDERS.items()}
-    places["true_hands"] = capture.root / TRUE_HANDS
-    for kind, place in places.items():
-        if kind in ("frames", "masks") or kind not in listed or place.exists():
+    for kind, place in {**IMAGE_FOLDERS, "true_hands": TRUE_HANDS}.items():
+        if kind in ("frames", "masks") or kind not in listed or (capture.root / place).exists():
             continue
-        scored = "Scores are taken over the estimated masks, and the digest says so; results do "
-        scored += "not compare with those of the whole capture."
-        yield Finding(
-            "warning",
-            os.fspath(capture.root / METADATA),
-            f"digests.{kind}",
-            f"lists {place.relative_to(capture.root)}, which is not there",
-            scored if kind == "true_masks" else "What needs this truth is refused.",
-        )
+        remedy = "What needs this truth is refused."
+        if kind == "true_masks":
+            remedy = "Scores are taken over the estimated masks, and the digest says so; results "
+            remedy += "do not compare with those of the whole capture."
+        said = f"lists {place}, which is not there"
+        yield _warning(capture.root / METADATA, f"digests.{kind}", said, remedy)
 
 
 def _numbers(capture: Capture) -> Iterator[Finding]:
-    yield from _compare(capture, "hands", arrays_digest(hand_arrays(capture.hands)))
-    cameras = {"Ks": capture.cameras.Ks, "viewmats": capture.cameras.viewmats}
-    yield from _compare(capture, "cameras", arrays_digest(cameras))
+    for part, digest in numbers_digests(capture.hands, capture.cameras).items():
+        yield from _compare(capture, part, digest)
     try:
         truth = capture.true_hands
     except HwpError as error:
@@ -392,12 +338,6 @@ def _numbers(capture: Capture) -> Iterator[Finding]:
 
 #: Colour of the projected hand, by side.
 COLOURS = {"right": (255, 160, 0), "left": (0, 170, 255)}
-#: The 20 bones between the 21 landmarks: wrist to each finger's base, then outwards.
-BONES = tuple(
-    (0 if joint == 0 else 4 * finger + joint, 4 * finger + joint + 1)
-    for finger in range(5)
-    for joint in range(4)
-)
 
 
 def contact_sheet(capture: Capture, *, count: int = 24, edge: int = 256) -> np.ndarray:
@@ -425,51 +365,25 @@ def project_landmarks(capture: Capture, frames: list[int]) -> Iterator[dict[str,
     """Yield, for each frame, the projected landmarks (21, 2) px of every valid hand, by side."""
     import torch
 
-    from hwp_bench.hands import load_template, pose_hand, project
+    from hwp_bench.hands import load_template, project
+    from hwp_bench.hands.skinning import pose_parameters
 
     Ks = torch.from_numpy(capture.cameras.Ks[frames])
     viewmats = torch.from_numpy(capture.cameras.viewmats[frames])
     pixels: dict[str, np.ndarray] = {}
     for side, hand in capture.hands.items():
-        tensors = load_template(capture.info.hand_model.source, side).to_torch(torch.float64)
-        posed = pose_hand(
-            tensors,
-            torch.from_numpy(hand.pose[frames]),
-            torch.from_numpy(hand.betas).expand(len(frames), -1),
-            torch.from_numpy(hand.transl[frames]),
-        )
+        template = load_template(capture.info.hand_model.source, side)
+        posed = pose_parameters(template, hand, frames)
         pixels[side] = project(posed.landmarks, viewmats, Ks)[0].numpy()
-    for index, frame in enumerate(frames):
-        yield {
-            side: points[index]
-            for side, points in pixels.items()
-            if capture.hands[side].valid[frame]
-        }
+    for row, frame in enumerate(frames):
+        yield {s: places[row] for s, places in pixels.items() if capture.hands[s].valid[frame]}
 
 
 def draw_hands(image: np.ndarray, points: dict[str, np.ndarray]) -> np.ndarray:
-    """Draw skeletons into a copy of an image.
-
-    Args:
-        image: (H, W, 3) uint8.
-        points: (21, 2) px by side, pixel centres at +0.5.
-    """
+    """Draw skeletons, (21, 2) px by side, into a copy of an image (H, W, 3) uint8."""
     canvas = image.copy()
     for side, landmarks in points.items():
-        # OpenCV counts pixel centres from 0, in fixed point with 3 fractional bits here.
-        # Beyond 1e6 it draws nothing anyway; NaN is far off too.
-        places = np.nan_to_num((landmarks - 0.5) * 8, nan=1e6)
-        spots = np.clip(places, -1e6, 1e6).round().astype(int)
-        for first, last in BONES:
-            cv2.line(
-                canvas,
-                tuple(spots[first].tolist()),
-                tuple(spots[last].tolist()),
-                COLOURS[side],
-                1,
-                cv2.LINE_AA,
-                3,
-            )
+        draw_bones(canvas, landmarks, COLOURS[side])
     return canvas
 
 

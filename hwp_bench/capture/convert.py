@@ -15,9 +15,9 @@ from hwp_bench.base.files import atomic_write
 from hwp_bench.capture.reader import Capture, identify_hand_model
 from hwp_bench.capture.writer import rewrite_capture
 from hwp_bench.hands.anchors import to_trimesh
-from hwp_bench.hands.fitting import FitTargets, FittedHand, FittingSettings, fit_hand
+from hwp_bench.hands.fitting import FitTargets, fit_hand
 from hwp_bench.hands.skeleton import HandParameters
-from hwp_bench.hands.skinning import pose_hand
+from hwp_bench.hands.skinning import pose_hand, pose_parameters
 from hwp_bench.hands.sources import load_template
 from hwp_bench.hands.template import HandTemplate
 
@@ -39,31 +39,20 @@ class ConversionError:
 
 
 def convert_hand(
-    hand: HandParameters,
-    source: HandTemplate,
-    target: HandTemplate,
-    settings: FittingSettings | None = None,
+    hand: HandParameters, source: HandTemplate, target: HandTemplate
 ) -> tuple[HandParameters, ConversionError]:
     """Express a hand in another hand model."""
     if source.side != target.side:
         raise UsageError(f"a {source.side} hand is not a {target.side} hand", field="target")
-    tensors = source.to_torch(torch.float64)
-    with torch.no_grad():
-        posed = pose_hand(tensors, *_tensors(hand))
+    posed = pose_parameters(source, hand)
     # Both wrists in the same place; the joints' axes agree between the models.
-    with torch.no_grad():
-        other = pose_hand(target.to_torch(torch.float64), *_tensors(_unshaped(hand)))
-    shift = (posed.joints[:, 0] - other.joints[:, 0]).numpy()
-    start = replace(_unshaped(hand), transl=hand.transl + shift)
+    unshaped = replace(hand, betas=np.zeros(10))
+    shift = (posed.joints[:, 0] - pose_parameters(target, unshaped).joints[:, 0]).numpy()
+    start = replace(unshaped, transl=hand.transl + shift)
     step = max(1, len(source.vertices) // SKIN_POINTS)
     targets = FitTargets(posed.landmarks.numpy(), skin=posed.vertices[:, ::step].numpy())
-    fitted = fit_hand(target, targets, start, settings)
-    return fitted.parameters, conversion_error(fitted)
-
-
-def conversion_error(fitted: FittedHand) -> ConversionError:
-    """Average a fit's errors over the valid frames."""
-    return ConversionError(
+    fitted = fit_hand(target, targets, start)
+    return fitted.parameters, ConversionError(
         landmark_mm=float(np.nanmean(fitted.landmark_mm)),
         skin_mm=float(np.nanmean(fitted.skin_mm)),
         worst_skin_mm=float(np.nanmax(fitted.skin_mm)),
@@ -95,35 +84,26 @@ def with_one_shape(
     clean = [
         np.where(valid.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0) for a in (pose, betas, transl)
     ]
-    tensors = template.to_torch(torch.float64)
+    hand = HandParameters(clean[0], common, clean[2], valid)
+    shared = pose_parameters(template, hand).vertices
     with torch.no_grad():
+        tensors = template.to_torch(torch.float64)
         own = pose_hand(tensors, *map(torch.from_numpy, clean)).vertices
-        shared = pose_hand(
-            tensors,
-            torch.from_numpy(clean[0]),
-            torch.from_numpy(common),
-            torch.from_numpy(clean[2]),
-        ).vertices
     shift = (own - shared).mean(dim=1)
     error = 1000.0 * (own - shared - shift[:, None]).norm(dim=-1).mean(dim=1).numpy()
-    hand = HandParameters(clean[0], common, clean[2] + shift.numpy(), valid)
+    hand = replace(hand, transl=hand.transl + shift.numpy())
     return hand, np.where(valid, error, np.nan)
 
 
 def convert_capture(
-    capture: Capture,
-    out: str | os.PathLike[str],
-    source: str,
-    *,
-    overwrite: bool = False,
-    settings: FittingSettings | None = None,
+    capture: Capture, out: str | os.PathLike[str], source: str, *, overwrite: bool = False
 ) -> dict[str, ConversionError]:
     """Write a capture again with its hands in another hand model; images stay as they are."""
     info = capture.info
     made, errors = {}, {}
     for side, hand in capture.hands.items():
         target = load_template(source, side)
-        made[side], errors[side] = convert_hand(hand, capture.template(side), target, settings)
+        made[side], errors[side] = convert_hand(hand, capture.template(side), target)
     note = {side: vars(error) for side, error in errors.items()}
     changed = replace(
         info,
@@ -132,14 +112,6 @@ def convert_capture(
     )
     rewrite_capture(capture, out, changed, made, overwrite=overwrite)
     return errors
-
-
-def _unshaped(hand: HandParameters) -> HandParameters:
-    return replace(hand, betas=np.zeros(10))
-
-
-def _tensors(hand: HandParameters) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    return torch.from_numpy(hand.pose), torch.from_numpy(hand.betas), torch.from_numpy(hand.transl)
 
 
 #: Mesh formats by the ending of the file; of these only `.glb` keeps two hands apart by name.
@@ -159,14 +131,13 @@ def hand_meshes(capture: Capture, frame: int, *, truth: bool = False) -> dict[st
                 remedy="Only simulated captures do; leave out --truth.",
             )
         hands = known
-    meshes = {}
-    for side in poses:
-        template, hand = capture.template(side), hands[side]
-        arrays = (hand.pose[frame : frame + 1], hand.betas, hand.transl[frame : frame + 1])
-        tensors = [torch.from_numpy(np.asarray(array, dtype=np.float64)) for array in arrays]
-        posed = pose_hand(template.to_torch(torch.float64), tensors[0], tensors[1], tensors[2])
-        meshes[side] = to_trimesh(posed.vertices[0], template.faces)
-    return meshes
+    return {
+        side: to_trimesh(
+            pose_parameters(capture.template(side), hands[side], [frame]).vertices[0],
+            capture.template(side).faces,
+        )
+        for side in poses
+    }
 
 
 def write_meshes(meshes: dict[str, trimesh.Trimesh], path: str | os.PathLike[str]) -> Path:

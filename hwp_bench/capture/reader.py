@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,6 +20,7 @@ from hwp_bench.capture.schema import (
     HANDS,
     IMAGE_FOLDERS,
     METADATA,
+    RGB_KINDS,
     SIDES,
     TRUE_HANDS,
     TRUE_TEMPLATE,
@@ -38,32 +40,21 @@ if TYPE_CHECKING:
 
 # Facts that a free-view clip shares with its capture.
 _SHARED = ("hands", "width", "height")
-
-
 _CONVERT = "Use the model that it was made with, or convert it: hwp-bench hands convert."
 
 
+@dataclass(repr=False, eq=False)
 class Capture:
-    """A capture on disk.
+    """A capture on disk."""
 
-    Attributes:
-        root: the folder.
-        info: its description, from `capture.json`.
-        hands: estimated hand parameters by side.
-        cameras: one camera a frame.
-    """
-
-    def __init__(
-        self,
-        root: Path,
-        info: CaptureInfo,
-        hands: dict[str, HandParameters],
-        cameras: Cameras,
-    ) -> None:
-        self.root = root
-        self.info = info
-        self.hands = hands
-        self.cameras = cameras
+    #: The folder.
+    root: Path
+    #: Its description, from `capture.json`.
+    info: CaptureInfo
+    #: Estimated hand parameters by side.
+    hands: dict[str, HandParameters]
+    #: One camera a frame.
+    cameras: Cameras
 
     def __len__(self) -> int:
         return self.info.frame_count
@@ -146,38 +137,35 @@ class Capture:
             BadImage: missing, damaged or of another size.
             UsageError: the capture has no such frame.
         """
-        return read_rgb(self._path("frames", frame), self.size)
+        return self.image("frames", frame)
 
     def mask(self, frame: int) -> np.ndarray:
         """Read the visible-hand mask that methods are given: (H, W) uint8, 255 = hand."""
-        return read_gray(self._path("masks", frame), self.size)
+        return self.image("masks", frame)
 
     def clean(self, frame: int) -> np.ndarray:
         """Read the clean version of a frame: (H, W, 3) uint8 sRGB."""
-        return read_rgb(self._path("clean", frame), self.size)
+        return self.image("clean", frame)
 
     def true_mask(self, frame: int) -> np.ndarray:
         """Read the exact coverage of visible hand: (H, W) uint8, 255 = covered fully."""
-        return read_gray(self._path("true_masks", frame), self.size)
+        return self.image("true_masks", frame)
 
     def clean_mask(self, frame: int) -> np.ndarray:
         """Read the visible hand of the clean frame: (H, W) uint8, 255 = covered fully."""
-        return read_gray(self._path("clean_masks", frame), self.size)
+        return self.image("clean_masks", frame)
+
+    def image(self, kind: str, frame: int) -> np.ndarray:
+        """Read an image of a kind, a key of `IMAGE_FOLDERS`; other arguments as of `frame`."""
+        path = image_path(self.root, kind, self._check(frame))
+        return (read_rgb if kind in RGB_KINDS else read_gray)(path, self.size)
 
     def hand_poses(self, frame: int) -> dict[str, HandPose]:
-        """Return the estimated parameters of every hand in one frame, by side.
-
-        Raises:
-            UsageError: the capture has no such frame.
-        """
+        """Return the estimated parameters of every hand in one frame, by side."""
         return hand_poses(self.hands, self._check(frame))
 
     def camera(self, frame: int) -> Camera:
-        """Return the camera of one frame.
-
-        Raises:
-            UsageError: the capture has no such frame.
-        """
+        """Return the camera of one frame."""
         return self.cameras.camera(self._check(frame), self.info.width, self.info.height)
 
     def template(self, side: str) -> HandTemplate:
@@ -206,17 +194,10 @@ class Capture:
         return read_subject_mesh(self.root / TRUE_TEMPLATE, self.template(side))
 
     def scoring_mask(self, frame: int) -> tuple[np.ndarray, bool]:
-        """Read the mask that scores are taken over.
-
-        Returns:
-            The mask (H, W) uint8, and whether it is exact coverage (True) or an estimate.
-        """
+        """Read the mask that scores are taken over, (H, W) uint8, and whether it is exact."""
         if self.has_true_masks:
             return self.true_mask(frame), True
         return self.mask(frame), False
-
-    def _path(self, kind: str, frame: int) -> Path:
-        return image_path(self.root, kind, self._check(frame))
 
     def _check(self, frame: int) -> int:
         frame = whole_number(frame, "frame")
@@ -235,13 +216,7 @@ def digest_at(root: Path, info: CaptureInfo) -> str:
 
 
 def open_capture(path: str | os.PathLike[str]) -> Capture:
-    """Open a capture folder.
-
-    Args:
-        path: the folder that holds `capture.json`.
-
-    Returns:
-        The capture; images are read (and checked) when they are asked for.
+    """Open the folder that holds `capture.json`; images are read and checked when asked for.
 
     Raises:
         BadCapture: not a capture folder, or its metadata is wrong; file and field are named.
@@ -268,12 +243,7 @@ def open_capture(path: str | os.PathLike[str]) -> Capture:
 def identify_hand_model(source: str, hands: str) -> HandModelId:
     """Say which hand model the parameters of a capture belong to, as its reader compares it.
 
-    Args:
-        source: the model, as `load_template` takes it.
-        hands: the hands that the capture has: `right`, `left` or `both`.
-
-    Raises:
-        UsageError, BadHandModel: it cannot be loaded.
+    `source` is the model, as `load_template` takes it; `hands` are `right`, `left` or `both`.
     """
     first = load_template(source, SIDES[hands][0])
     return HandModelId(first.name, first.digest, source)
@@ -293,7 +263,11 @@ def load_matching_template(
         )
     if first.digest != model.digest:
         other = "left" if sides[0] == "right" else "right"
-        if model.digest == _digest(model.source, other):
+        try:
+            exchanged = model.digest == load_template(model.source, other).digest
+        except HwpError:  # it cannot be loaded here
+            exchanged = False
+        if exchanged:
             raise BadCapture(
                 f"is the digest of the {other} hand of {model.name}; the capture's first hand is "
                 f"the {sides[0]} one",
@@ -310,11 +284,3 @@ def load_matching_template(
             remedy=_CONVERT,
         )
     return first if side == sides[0] else load_template(model.source, side)
-
-
-def _digest(source: str, side: str) -> str | None:
-    """Digest of one hand of a model; None where it cannot be loaded."""
-    try:
-        return load_template(source, side).digest
-    except HwpError:
-        return None

@@ -48,6 +48,8 @@ IMAGE_FOLDERS = {
     "true_masks": "truth/masks",
     "clean_masks": "truth/clean_masks",
 }
+#: Kinds of images that are coloured; the others are coverage.
+RGB_KINDS = ("frames", "clean")
 #: Most frames that a capture may claim.
 MAX_FRAMES = 100_000
 #: Largest edge of a frame, in pixels.
@@ -143,25 +145,14 @@ class CaptureInfo:
         """Return the JSON object that `from_json` reads."""
         return {
             "schema": SCHEMA,
-            "id": self.id,
-            "hands": self.hands,
-            "action": self.action,
-            "device": self.device,
+            **vars(self),
             "fps": float(self.fps),
-            "width": self.width,
-            "height": self.height,
-            "frame_count": self.frame_count,
-            "hand_model": {
-                "name": self.hand_model.name,
-                "digest": self.hand_model.digest,
-                "source": self.hand_model.source,
-            },
+            "hand_model": dict(vars(self.hand_model)),
             "perturbations": {
                 name: None if values is None else list(values)
                 for name, values in self.perturbations.items()
             },
             "source": dict(self.source),
-            "licence": self.licence,
             "digests": dict(self.digests or {}),
         }
 
@@ -183,7 +174,15 @@ class CaptureInfo:
         info = parse_record(
             cls, content, where=where, error=BadCapture, complete=True, ignore_unknown=True
         )
-        _check_severities(info, where)
+        for name, values in info.perturbations.items():
+            place = f"perturbations.{name}"
+            perturbation(name, where=where, field="perturbations")
+            if values is None:
+                continue
+            if len(values) != info.frame_count:
+                said = f"must be null or a list of {info.frame_count} severities"
+                raise BadCapture(said, where=where, field=place)
+            check_severity(values, where=where, field=place)
         check_id(info.id, where)
         return info
 
@@ -197,19 +196,6 @@ def check_id(identifier: str, where: str) -> None:
             field="id",
             remedy="Use up to 100 letters, digits, dots, underscores and hyphens.",
         )
-
-
-def _check_severities(info: CaptureInfo, where: str) -> None:
-    for name, values in info.perturbations.items():
-        place = f"perturbations.{name}"
-        perturbation(name, where=where, field="perturbations")
-        if values is None:
-            continue
-        if len(values) != info.frame_count:
-            raise BadCapture(
-                f"must be null or a list of {info.frame_count} severities", where=where, field=place
-            )
-        check_severity(values, where=where, field=place)
 
 
 def image_path(root: Path, kind: str, frame: int) -> Path:
@@ -253,12 +239,7 @@ class Cameras:
 
 
 def check_cameras(Ks: np.ndarray, viewmats: np.ndarray, *, where: str) -> None:
-    """Refuse cameras that cannot project.
-
-    Args:
-        Ks: (F, 3, 3) intrinsics, px.
-        viewmats: (F, 4, 4) world to camera.
-    """
+    """Refuse cameras that cannot project: (F, 3, 3) px, and (F, 4, 4) world to camera."""
     arrays = {"Ks": np.asarray(Ks), "viewmats": np.asarray(viewmats)}
     count = len(arrays["Ks"])
     K = take(arrays, "Ks", (count, 3, 3), where=where, most=LARGEST)
@@ -340,6 +321,14 @@ def arrays_digest(arrays: Mapping[str, np.ndarray]) -> str:
         total.update(f"{name}{array.shape}{array.dtype.str}".encode())
         total.update(array.tobytes())
     return total.hexdigest()
+
+
+def numbers_digests(hands: Mapping[str, HandParameters], cameras: Cameras) -> dict[str, str]:
+    """Return the digests of a capture's `hands` and `cameras`."""
+    return {
+        "hands": arrays_digest(hand_arrays(hands)),
+        "cameras": arrays_digest({"Ks": cameras.Ks, "viewmats": cameras.viewmats}),
+    }
 
 
 # Largest file that is read, unpacked, in bytes: both hands of a MANO-HD have a tenth of it.

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -249,39 +250,24 @@ class AuditReport:
 
 
 def audit_split(
-    capture: Capture,
-    split: Split,
-    *,
-    threshold: float = NEAR_DUPLICATE_RMS,
-    bits: int = SAME_IMAGE_BITS,
+    capture: Capture, split: Split, *, threshold: float = NEAR_DUPLICATE_RMS
 ) -> AuditReport:
     """Audit the split of a capture.
 
-    Args:
-        capture: the capture.
-        split: its split.
-        threshold: RMS difference of 32x32 thumbnails, in 8-bit levels, below which two frames
-            count as near-copies.
-        bits: most bits in which the perceptual hashes of one image differ.
-
-    Returns:
-        The report; near-copies are reported, not judged, because neighbouring frames of a still
-        hand are alike in every video.
+    Near-copies are reported, not judged: neighbouring frames of a still hand are alike in every
+    video. `threshold` is in 8-bit levels.
     """
-    parts = {part: set(np.arange(*split.range(part)).tolist()) for part in PARTS}
-    seen: dict[int, int] = {}
-    for frames in parts.values():
-        for frame in frames:
-            seen[frame] = seen.get(frame, 0) + 1
+    parts = {part: np.arange(*split.range(part)).tolist() for part in PARTS}
+    seen = Counter(frame for frames in parts.values() for frame in frames)
     perturbations = capture.info.perturbations
     perturbed = [
         (frame, name)
-        for frame in sorted(parts["test"])
+        for frame in parts["test"]
         for name, values in perturbations.items()
         if values is not None and values[frame] > 0
     ]
     duplicates = _near_duplicates(capture, split, threshold)
-    hashes = _same_hashes(capture, split, bits)
+    hashes = _same_hashes(capture, split)
     return AuditReport(
         capture=capture.info.id,
         counts={part: len(frames) for part, frames in parts.items()},
@@ -300,25 +286,33 @@ def _guard(split: Split, others: Iterable[int]) -> int:
     return max((split.test_range[0] - other for other in others), default=0)
 
 
-def _same_hashes(capture: Capture, split: Split, bits: int) -> tuple[tuple[int, int, int], ...]:
+def _features(
+    capture: Capture, split: Split, feature: Callable[[np.ndarray], np.ndarray]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The frames that are not for test, and a feature of the test frames and of those."""
+    others = np.concatenate([split.train, split.validation])
+    with ThreadPoolExecutor() as pool:
+        test, seen = (
+            np.stack(list(pool.map(lambda frame: feature(capture.frame(frame)), frames.tolist())))
+            for frames in (split.test, others)
+        )
+    return others, test, seen
+
+
+def _same_hashes(capture: Capture, split: Split) -> tuple[tuple[int, int, int], ...]:
     """Pairs of frames with nearly one perceptual hash (OpenCV's PHash, 64 bits)."""
     import cv2
 
-    def hashed(frame: int) -> np.ndarray:
-        code = cv2.img_hash.pHash(capture.frame(frame)[:, :, ::-1].copy())
-        return np.unpackbits(np.asarray(code, dtype=np.uint8).ravel())
+    def hashed(image: np.ndarray) -> np.ndarray:
+        code = cv2.img_hash.pHash(image[:, :, ::-1].copy())
+        return np.unpackbits(np.asarray(code, dtype=np.uint8).ravel()).astype(np.int32)
 
-    others = np.concatenate([split.train, split.validation])
-    with ThreadPoolExecutor() as pool:
-        test = np.stack(list(pool.map(hashed, split.test.tolist()))).astype(np.int32)
-        seen = np.stack(list(pool.map(hashed, others.tolist()))).astype(np.int32)
+    others, test, seen = _features(capture, split, hashed)
     # Bits that differ: |a| + |b| - 2 a.b for vectors of zeros and ones.
     distance = test.sum(1)[:, None] + seen.sum(1)[None] - 2 * test @ seen.T
-    pairs = np.argwhere(distance <= bits)
-    return tuple(
-        (int(split.test[row]), int(others[column]), int(distance[row, column]))
-        for row, column in pairs
-    )
+    rows, columns = np.nonzero(distance <= SAME_IMAGE_BITS)
+    found = (split.test[rows], others[columns], distance[rows, columns])
+    return tuple(zip(*(values.tolist() for values in found), strict=True))
 
 
 def _near_duplicates(
@@ -326,22 +320,14 @@ def _near_duplicates(
 ) -> tuple[tuple[int, int, float], ...]:
     import cv2
 
-    def thumbnail(frame: int) -> np.ndarray:
-        small = cv2.resize(
-            capture.frame(frame), (THUMBNAIL, THUMBNAIL), interpolation=cv2.INTER_AREA
-        )
-        return small.astype(np.float32).ravel()
+    def thumbnail(image: np.ndarray) -> np.ndarray:
+        small = cv2.resize(image, (THUMBNAIL, THUMBNAIL), interpolation=cv2.INTER_AREA)
+        return small.astype(np.float64).ravel()
 
-    others = np.concatenate([split.train, split.validation])
-    with ThreadPoolExecutor() as pool:
-        test = np.stack(list(pool.map(thumbnail, split.test.tolist())))
-        seen = np.stack(list(pool.map(thumbnail, others.tolist())))
+    others, test, seen = _features(capture, split, thumbnail)
     # |a - b|^2 = |a|^2 + |b|^2 - 2 a.b, in float64: the difference of large numbers is small.
-    test, seen = test.astype(np.float64), seen.astype(np.float64)
     squared = (test**2).sum(1)[:, None] + (seen**2).sum(1)[None] - 2 * test @ seen.T
     rms = np.sqrt(np.maximum(squared, 0) / test.shape[1])
-    pairs = np.argwhere(rms < threshold)
-    return tuple(
-        (int(split.test[row]), int(others[column]), float(rms[row, column]))
-        for row, column in pairs
-    )
+    rows, columns = np.nonzero(rms < threshold)
+    found = (split.test[rows], others[columns], rms[rows, columns])
+    return tuple(zip(*(values.tolist() for values in found), strict=True))

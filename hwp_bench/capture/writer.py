@@ -21,13 +21,14 @@ from hwp_bench.capture.schema import (
     EXTRA,
     HANDS,
     METADATA,
+    RGB_KINDS,
     TRUE_HANDS,
     Cameras,
     CaptureInfo,
     arrays_digest,
-    check_id,
     hand_arrays,
     image_path,
+    numbers_digests,
     write_cameras,
     write_hands,
 )
@@ -64,7 +65,6 @@ class CaptureWriter:
     ) -> None:
         self.path = Path(path)
         self.info = CaptureInfo.from_json(info.to_json(), where=os.fspath(path))
-        check_id(info.id, os.fspath(path))
         self._check_hands(hands)
         if len(cameras) != info.frame_count:
             raise BadCapture(
@@ -97,23 +97,23 @@ class CaptureWriter:
 
     def frame(self, frame: int, rgb: np.ndarray) -> None:
         """Store one frame: (H, W, 3) uint8 sRGB."""
-        self._image("frames", frame, rgb, 3)
+        self.image("frames", frame, rgb)
 
     def mask(self, frame: int, coverage: np.ndarray) -> None:
         """Store the visible-hand mask that methods are given: (H, W) uint8, 255 = hand."""
-        self._image("masks", frame, coverage, 2)
+        self.image("masks", frame, coverage)
 
     def clean(self, frame: int, rgb: np.ndarray) -> None:
         """Store the frame without any perturbation (truth): (H, W, 3) uint8 sRGB."""
-        self._image("clean", frame, rgb, 3)
+        self.image("clean", frame, rgb)
 
     def true_mask(self, frame: int, coverage: np.ndarray) -> None:
         """Store the exact coverage of visible hand (truth): (H, W) uint8, 255 = covered fully."""
-        self._image("true_masks", frame, coverage, 2)
+        self.image("true_masks", frame, coverage)
 
     def clean_mask(self, frame: int, coverage: np.ndarray) -> None:
         """Store the visible hand of the clean frame (truth): (H, W) uint8, 255 = all hand."""
-        self._image("clean_masks", frame, coverage, 2)
+        self.image("clean_masks", frame, coverage)
 
     def true_hands(self, hands: Mapping[str, HandParameters]) -> None:
         """Store the true hand parameters by side."""
@@ -131,8 +131,10 @@ class CaptureWriter:
         folder.mkdir(exist_ok=True)
         atomic_write(inside(folder, name), data)
 
-    def _image(self, kind: str, frame: int, pixels: np.ndarray, dimensions: int) -> None:
-        expected = (self.info.height, self.info.width, 3)[:dimensions]
+    def image(self, kind: str, frame: int, pixels: np.ndarray) -> None:
+        """Store an image of a kind, a key of `IMAGE_FOLDERS`."""
+        channels = (3,) if kind in RGB_KINDS else ()
+        expected = (self.info.height, self.info.width, *channels)
         if pixels.shape != expected or pixels.dtype != np.uint8:
             raise ShapeMismatch(
                 f"is {pixels.dtype} {pixels.shape} where uint8 {expected} is expected",
@@ -140,49 +142,34 @@ class CaptureWriter:
                 field=f"{kind}[{frame}]",
             )
         if not 0 <= frame < self.info.frame_count:
-            raise BadCapture(
-                f"frame {frame} is not among the {self.info.frame_count} frames",
-                where=self.path,
-                field=kind,
-            )
+            said = f"frame {frame} is not among the {self.info.frame_count} frames"
+            raise BadCapture(said, where=self.path, field=kind)
         write_image(image_path(self._root, kind, frame), pixels)
         self._digests.setdefault(kind, {})[frame] = pixel_digest(pixels)
 
     def _check_hands(self, hands: Mapping[str, HandParameters]) -> None:
         if set(hands) != set(self.info.sides):
-            raise BadCapture(
-                f"parameters of {sorted(hands)} for a capture of {list(self.info.sides)}",
-                where=self.path,
-                field="hands",
-            )
+            said = f"parameters of {sorted(hands)} for a capture of {list(self.info.sides)}"
+            raise BadCapture(said, where=self.path, field="hands")
         for side, parameters in hands.items():
             if len(parameters.pose) != self.info.frame_count:
-                raise BadCapture(
-                    f"{len(parameters.pose)} poses for {self.info.frame_count} frames",
-                    where=self.path,
-                    field=f"hands.{side}",
-                )
+                said = f"{len(parameters.pose)} poses for {self.info.frame_count} frames"
+                raise BadCapture(said, where=self.path, field=f"hands.{side}")
 
     def _finish(self) -> None:
         count = self.info.frame_count
         for kind in {"frames", "masks", *self._digests}:
             missing = set(range(count)) - set(self._digests.get(kind, {}))
             if missing:
-                raise BadCapture(
-                    f"{len(missing)} of {count} images were not given (first: {min(missing)})",
-                    where=self.path,
-                    field=kind,
-                )
+                said = f"{len(missing)} of {count} images were not given (first: {min(missing)})"
+                raise BadCapture(said, where=self.path, field=kind)
         digests = {
             kind: combine(by_frame[frame] for frame in range(count))
             for kind, by_frame in self._digests.items()
         }
         write_hands(self._root / HANDS, self._hands)
         write_cameras(self._root / CAMERAS, self._cameras)
-        digests["hands"] = arrays_digest(hand_arrays(self._hands))
-        digests["cameras"] = arrays_digest(
-            {"Ks": self._cameras.Ks, "viewmats": self._cameras.viewmats}
-        )
+        digests |= numbers_digests(self._hands, self._cameras)
         if self._true_hands is not None:
             write_hands(self._root / TRUE_HANDS, self._true_hands)
             digests["true_hands"] = arrays_digest(hand_arrays(self._true_hands))
@@ -200,14 +187,11 @@ def rewrite_capture(
 ) -> None:
     """Copy a capture with other hands. True hands are left out: they are of the old model."""
     with CaptureWriter(out, info, hands, capture.cameras, overwrite=overwrite) as writer:
+        kinds = ["frames", "masks", *["true_masks"] * capture.has_true_masks]
+        kinds += ["clean", "clean_masks"] * capture.has_clean
         for frame in range(len(capture)):
-            writer.frame(frame, capture.frame(frame))
-            writer.mask(frame, capture.mask(frame))
-            if capture.has_true_masks:
-                writer.true_mask(frame, capture.true_mask(frame))
-            if capture.has_clean:
-                writer.clean(frame, capture.clean(frame))
-                writer.clean_mask(frame, capture.clean_mask(frame))
+            for kind in kinds:
+                writer.image(kind, frame, capture.image(kind, frame))
 
 
 def combine(digests: Iterable[str]) -> str:

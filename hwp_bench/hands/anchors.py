@@ -76,9 +76,8 @@ def sample_surface(
     Square" (2019); the sequence is Roberts' R2.
     """
     if count < 1:
-        raise UsageError(
-            f"{count} anchors are not possible", field="count", remedy="Use at least 1."
-        )
+        said = f"{count} anchors are not possible"
+        raise UsageError(said, field="count", remedy="Use at least 1.")
     random = np.random.default_rng(seed)
     corners = template.vertices[template.faces]
     areas = np.linalg.norm(
@@ -92,22 +91,21 @@ def sample_surface(
     face_index = np.repeat(np.arange(len(areas)), shares)
     position = np.arange(count) - np.repeat(bounds - shares, shares)
     start = random.uniform(size=(len(areas), 2))[face_index]
-    square = (start + position[:, None] * _R2_STEP) % 1.0
-    return SurfaceAnchors(face_index, _square_to_triangle(square))
+    x, y = ((start + position[:, None] * _R2_STEP) % 1.0).T
+    upper = y > x
+    first = np.where(upper, 0.5 * x, x - 0.5 * y)
+    second = np.where(upper, y - 0.5 * x, 0.5 * y)
+    mix = np.stack([first, second, 1.0 - first - second], axis=1)
+    return SurfaceAnchors(face_index, mix)
 
 
 def anchor_positions(
     vertices: torch.Tensor, faces: torch.Tensor, anchors: SurfaceAnchors
 ) -> torch.Tensor:
-    """Compute the places of the anchors.
-
-    Args:
-        vertices: (B, V, 3) or (V, 3) m.
-        faces: (F, 3) int64.
-        anchors: N anchors.
+    """Compute the places of N anchors of vertices (B, V, 3) or (V, 3) m, differentiably.
 
     Returns:
-        (B, N, 3) or (N, 3) m; differentiable in `vertices`.
+        (B, N, 3) or (N, 3) m.
     """
     corners, mix = _gather(faces, anchors, vertices)
     return _mix(vertices, corners, mix)
@@ -132,9 +130,7 @@ def anchor_frames(
 
     The columns are tangent, bitangent and smooth normal. The tangent is the first edge of the
     anchor's face, made perpendicular to the normal: a material direction, so that it follows
-    every motion of the skin.
-
-    Arguments as in `anchor_positions`.
+    every motion of the skin. Arguments as in `anchor_positions`.
 
     Returns:
         (B, N, 3, 3) or (N, 3, 3) rotation matrices, also on degenerate faces.
@@ -156,15 +152,9 @@ def anchor_uv(template: HandTemplate, anchors: SurfaceAnchors) -> np.ndarray:
 
 
 def vertex_normals(vertices: torch.Tensor, faces: torch.Tensor) -> torch.Tensor:
-    """Compute outward unit normals at the vertices: face normals averaged by area.
+    """Compute outward unit normals at vertices (B, V, 3) or (V, 3): face normals by area.
 
-    Args:
-        vertices: (B, V, 3) or (V, 3) m.
-        faces: (F, 3) int64, counter-clockwise from outside.
-
-    Returns:
-        Normals of the vertices' shape. A vertex without a face of any area gets (0, 0, 1) and
-        no gradient.
+    A vertex without a face of any area gets (0, 0, 1) and no gradient.
     """
     corners = vertices[..., faces, :]
     edges = corners[..., 1:, :] - corners[..., :1, :]
@@ -189,25 +179,12 @@ def unit_or(vectors: torch.Tensor, fallback: torch.Tensor) -> torch.Tensor:
 
 
 def to_trimesh(vertices: torch.Tensor | np.ndarray, faces: Any) -> trimesh.Trimesh:
-    """Make a trimesh mesh; the vertices are kept as they are (no merging).
-
-    Args:
-        vertices: (V, 3) m.
-        faces: (F, 3).
-    """
+    """Make a trimesh mesh of vertices (V, 3) and faces (F, 3), which are kept as they are."""
     import trimesh
 
     if isinstance(vertices, torch.Tensor):
         vertices = vertices.detach().cpu().numpy()
     return trimesh.Trimesh(np.asarray(vertices), np.asarray(faces), process=False)
-
-
-def _square_to_triangle(square: np.ndarray) -> np.ndarray:
-    x, y = square.T
-    upper = y > x
-    first = np.where(upper, 0.5 * x, x - 0.5 * y)
-    second = np.where(upper, y - 0.5 * x, 0.5 * y)
-    return np.stack([first, second, 1.0 - first - second], axis=1)
 
 
 def _gather(
@@ -255,10 +232,9 @@ class Footprint:
 
 
 class HandSurfaces:
-    """The surfaces of a capture's hands, cut into cells: the places that frames have in common.
+    """The surfaces of a capture's hands, cut into cells (of edge `patch_size`, m).
 
-    Args:
-        patch_size: edge of a cell, m.
+    Cells are the places that frames have in common.
     """
 
     def __init__(self, templates: Mapping[str, HandTemplate], patch_size: float) -> None:
@@ -305,13 +281,7 @@ class HandSurfaces:
         frames: np.ndarray,
         size: tuple[int, int],
     ) -> Iterator[Footprint]:
-        """Draw the hands in some frames, in their order.
-
-        Args:
-            Ks: (F, 3, 3) px.
-            viewmats: (F, 4, 4).
-            frames: (R,) which frames.
-        """
+        """Draw the hands in some frames (R,), in their order; Ks (F, 3, 3), viewmats (F, 4, 4)."""
         before: tuple[int, np.ndarray] | None = None
         for start in range(0, len(frames), _CHUNK):
             part = frames[start : start + _CHUNK]

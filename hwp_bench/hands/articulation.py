@@ -45,10 +45,10 @@ def axis_angle_to_matrix(axis_angle: torch.Tensor) -> torch.Tensor:
     closed_of = torch.where(small, torch.ones_like(squared), squared)
     angle = closed_of.sqrt()
     half_sine = torch.sin(0.5 * angle)
-    sine_ratio = torch.where(small, _sine_series(series_of), torch.sin(angle) / angle)
-    cosine_ratio = torch.where(
-        small, _cosine_series(series_of), 2.0 * half_sine * half_sine / closed_of
-    )
+    sine_series = _series(series_of, 72.0, 42.0, 20.0, 6.0)
+    cosine_series = 0.5 * _series(series_of, 90.0, 56.0, 30.0, 12.0)
+    sine_ratio = torch.where(small, sine_series, torch.sin(angle) / angle)
+    cosine_ratio = torch.where(small, cosine_series, 2.0 * half_sine * half_sine / closed_of)
     cross = cross_matrix(axis_angle)
     identity = torch.eye(3, dtype=axis_angle.dtype, device=axis_angle.device)
     outer = axis_angle.unsqueeze(-1) * axis_angle.unsqueeze(-2)
@@ -68,18 +68,12 @@ def _bounded(vector: torch.Tensor) -> torch.Tensor:
     return vector * (torch.finfo(vector.dtype).max ** 0.25 / longest).clamp(max=1.0)
 
 
-def _sine_series(squared: torch.Tensor) -> torch.Tensor:
-    term = 1.0 - squared / 72.0
-    for denominator in (42.0, 20.0, 6.0):
+def _series(squared: torch.Tensor, *denominators: float) -> torch.Tensor:
+    """1 - x / a (1 - x / b (1 - ...)) of denominators ..., b, a."""
+    term = torch.ones_like(squared)
+    for denominator in denominators:
         term = 1.0 - squared / denominator * term
     return term
-
-
-def _cosine_series(squared: torch.Tensor) -> torch.Tensor:
-    term = 1.0 - squared / 90.0
-    for denominator in (56.0, 30.0, 12.0):
-        term = 1.0 - squared / denominator * term
-    return 0.5 * term
 
 
 def cross_matrix(vector: torch.Tensor) -> torch.Tensor:
@@ -119,25 +113,21 @@ def matrix_to_axis_angle(matrix: torch.Tensor) -> torch.Tensor:
     """
     diagonal = matrix.diagonal(dim1=-2, dim2=-1)
     x, y, z = diagonal.unbind(dim=-1)
-    skew = torch.stack(
-        [
-            matrix[..., 2, 1] - matrix[..., 1, 2],
-            matrix[..., 0, 2] - matrix[..., 2, 0],
-            matrix[..., 1, 0] - matrix[..., 0, 1],
-        ],
-        dim=-1,
-    )
+    skew = [
+        matrix[..., row, column] - matrix[..., column, row]
+        for row, column in ((2, 1), (0, 2), (1, 0))
+    ]
     # 4 q q^T: each row is the quaternion (w, x, y, z) times four of its own entries.
     symmetric = matrix + matrix.mT
     off = [symmetric[..., 0, 1], symmetric[..., 0, 2], symmetric[..., 1, 2]]
     trace = x + y + z
     rows = [
-        torch.stack([1.0 + trace, skew[..., 0], skew[..., 1], skew[..., 2]], dim=-1),
-        torch.stack([skew[..., 0], 1.0 + 2.0 * x - trace, off[0], off[1]], dim=-1),
-        torch.stack([skew[..., 1], off[0], 1.0 + 2.0 * y - trace, off[2]], dim=-1),
-        torch.stack([skew[..., 2], off[1], off[2], 1.0 + 2.0 * z - trace], dim=-1),
+        [1.0 + trace, *skew],
+        [skew[0], 1.0 + 2.0 * x - trace, off[0], off[1]],
+        [skew[1], off[0], 1.0 + 2.0 * y - trace, off[2]],
+        [skew[2], off[1], off[2], 1.0 + 2.0 * z - trace],
     ]
-    products = torch.stack(rows, dim=-2)
+    products = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
     largest = products.diagonal(dim1=-2, dim2=-1).argmax(dim=-1)
     index = largest[..., None, None].expand(*largest.shape, 1, 4)
     quaternion = products.gather(-2, index).squeeze(-2)
@@ -306,10 +296,9 @@ def joint_limit_penalty(pose: torch.Tensor, template: HandTemplate | JointLimits
 
 
 def rest_flexion(template: HandTemplate) -> np.ndarray:
-    """Measure how far each joint is bent in the rest mesh, relative to a straight finger.
+    """How far each joint is bent in the rest mesh, (15,) rad, relative to a straight finger.
 
-    Returns:
-        (15,) rad; zero for the thumb's first joint, which has no straight position.
+    Zero for the thumb's first joint, which has no straight position.
     """
     axes = joint_axes(template)
     angles = np.zeros(FINGER_JOINT_COUNT)

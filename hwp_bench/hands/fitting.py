@@ -18,6 +18,14 @@ from hwp_bench.hands.template import HandTemplate, TemplateTensors, boundary_ver
 
 #: Points farther from the fitted surface than this have no effect, m.
 REACH = 0.03
+# Steps with landmarks and lines of sight only, and with the skin.
+_LANDMARK_STEPS, _SKIN_STEPS = 150, 60
+# The nearest vertices are found again after this many steps.
+_REFRESH = 15
+# Weight of the landmarks in the steps with skin: models put joints in different places.
+_LANDMARK_WEIGHT = 0.1
+# Weights of anatomical joint limits, mm^2 per rad^2, and of the squared shape parameters, mm^2.
+_LIMITS, _SHAPE = 30.0, 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,24 +43,6 @@ class FitTargets:
     skin: np.ndarray | None = None
 
 
-@dataclass(frozen=True)
-class FittingSettings:
-    """Steps and weights of a fit."""
-
-    #: Steps with landmarks and lines of sight only.
-    landmark_steps: int = 150
-    #: Steps with the skin.
-    skin_steps: int = 60
-    #: The nearest vertices are found again after this many steps.
-    refresh: int = 15
-    #: Weight of the landmarks in the steps with skin: models put joints in different places.
-    landmark_weight: float = 0.1
-    #: Weight of anatomical joint limits, mm^2 per rad^2.
-    limits: float = 30.0
-    #: Weight of the squared shape parameters, mm^2.
-    shape: float = 0.02
-
-
 @dataclass(frozen=True, eq=False)
 class FittedHand:
     """A hand fitted to targets, and its distances from them."""
@@ -65,21 +55,15 @@ class FittedHand:
     skin_mm: np.ndarray
 
 
-def fit_hand(
-    template: HandTemplate,
-    targets: FitTargets,
-    start: HandParameters,
-    settings: FittingSettings | None = None,
-) -> FittedHand:
+def fit_hand(template: HandTemplate, targets: FitTargets, start: HandParameters) -> FittedHand:
     """Fit pose, one shape and translation, by Adam from a start; all frames at once."""
-    settings = settings or FittingSettings()
     if not start.valid.any() or (targets.landmarks is None and targets.skin is None):
         raise BadInput("no frame is valid, or no points are known", field="targets")
     chosen = np.flatnonzero(start.valid)
     fit = _Fit(template, targets, start, chosen)
-    fit.run(settings, settings.landmark_steps, skin=False)
+    fit.run(_LANDMARK_STEPS, skin=False)
     if targets.skin is not None:
-        fit.run(settings, settings.skin_steps, skin=True)
+        fit.run(_SKIN_STEPS, skin=True)
     return fit.result(start)
 
 
@@ -106,7 +90,7 @@ class _Fit:
         self.betas = torch.tensor(start.betas, requires_grad=True)
         self.transl = torch.tensor(start.transl[chosen], requires_grad=True)
 
-    def run(self, settings: FittingSettings, steps: int, *, skin: bool) -> None:
+    def run(self, steps: int, *, skin: bool) -> None:
         """Take `steps` steps; the rate falls to a fiftieth along a cosine."""
         rate = 0.3 if skin else 1.0
         optimizer = torch.optim.Adam(
@@ -124,16 +108,16 @@ class _Fit:
         for step in range(steps):
             optimizer.zero_grad(set_to_none=True)
             posed = self._posed(self.whole if skin else self.tips)
-            energy = self._landmark_energy(posed, settings)
+            energy = self._landmark_energy(posed)
             if skin:
-                if step % settings.refresh == 0:
+                if step % _REFRESH == 0:
                     matches = self._match(posed)
                 assert matches is not None
                 index, normals, near = matches
-                energy = settings.landmark_weight * energy
+                energy = _LANDMARK_WEIGHT * energy
                 energy = energy + 1e6 * _squared(self._gaps(posed, index, normals), near)
-            energy = energy + settings.limits * joint_limit_penalty(self.pose, self.limits).mean()
-            energy = energy + settings.shape * (self.betas**2).sum()
+            energy = energy + _LIMITS * joint_limit_penalty(self.pose, self.limits).mean()
+            energy = energy + _SHAPE * (self.betas**2).sum()
             if not math.isfinite(float(energy.detach())):
                 raise DidNotConverge("the fit of a hand left the finite numbers")
             energy.backward()
@@ -164,7 +148,7 @@ class _Fit:
     def _posed(self, tensors: TemplateTensors) -> PosedHand:
         return pose_hand(tensors, self.pose, self.betas, self.transl)
 
-    def _landmark_energy(self, posed: PosedHand, settings: FittingSettings) -> torch.Tensor:
+    def _landmark_energy(self, posed: PosedHand) -> torch.Tensor:
         energy = self.betas.sum() * 0.0
         if self.landmarks is not None:
             known = torch.isfinite(self.landmarks).all(dim=-1)

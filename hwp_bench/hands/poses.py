@@ -16,7 +16,7 @@ from hwp_bench.hands.skeleton import FINGERS, PARENTS, finger_joints, landmark_o
 from hwp_bench.hands.template import HandTemplate
 
 #: First joint of each finger in MANO's order.
-FIRST_JOINT = MappingProxyType({"index": 1, "middle": 4, "little": 7, "ring": 10, "thumb": 13})
+FIRST_JOINT = MappingProxyType({finger: finger_joints(finger)[0] for finger in FINGERS})
 #: Lowest and highest angle in degrees for the thumb, then for every other finger.
 LIMITS = (
     np.array([[-30.0, 70.0], [-35.0, 45.0], [-20.0, 70.0], [-25.0, 85.0]]),
@@ -86,7 +86,7 @@ def finger_pose(angles: np.ndarray, joints: np.ndarray) -> np.ndarray:
     angles = np.radians(within_limits(np.asarray(angles, dtype=np.float64)))
     pose = np.zeros((16, 3))
     for row, finger in enumerate(FINGERS):
-        first = FIRST_JOINT[finger]
+        first = finger_joints(finger)[0]
         bones = np.diff(joints[first : first + 3], axis=0)
         bones = np.vstack([bones, bones[-1]])
         bones /= np.linalg.norm(bones, axis=1, keepdims=True)
@@ -139,8 +139,7 @@ class PosedSkeleton:
 
     def seen_by(self, views: np.ndarray) -> PosedSkeleton:
         """The same in the axes of cameras (F, 4, 4)."""
-        turn = views[:, None, :3, :3]
-        place = views[:, None, :3, 3]
+        turn, place = views[:, None, :3, :3], views[:, None, :3, 3]
         return PosedSkeleton(
             turns=turn @ self.turns,
             joints=(turn @ self.joints[..., None])[..., 0] + place,
@@ -158,12 +157,7 @@ def rest_skeleton(model: HandTemplate, betas: np.ndarray) -> RestSkeleton:
 
 
 def posed_skeleton(rest: RestSkeleton, pose: np.ndarray, transl: np.ndarray) -> PosedSkeleton:
-    """Pose a skeleton.
-
-    Args:
-        pose: (F, 16, 3) axis-angle rad.
-        transl: (F, 3) m.
-    """
+    """Pose a skeleton: (F, 16, 3) axis-angle rad, and (F, 3) m."""
     from scipy.spatial.transform import Rotation
 
     frames = len(pose)
@@ -216,11 +210,7 @@ def landmark_rows(
 
 
 def hand_extent(landmarks: np.ndarray) -> float:
-    """Median over frames of the larger side of the landmarks' box, in slopes of the camera.
-
-    Args:
-        landmarks: (F, 21, 3) m, camera axes.
-    """
+    """Median over frames of the larger side of the box of landmarks (F, 21, 3), in slopes."""
     slopes = landmarks[..., :2] / landmarks[..., 2:]
     return float(np.median((slopes.max(axis=1) - slopes.min(axis=1)).max(axis=1)))
 

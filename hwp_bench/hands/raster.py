@@ -9,11 +9,14 @@ from __future__ import annotations
 import numpy as np
 
 from hwp_bench.base.kernels import compiled
+from hwp_bench.hands.skeleton import LANDMARK_EDGES
 
 # Faces with a corner nearer to the camera than this, m, are left out.
 _NEAR = 1e-3
 # Faces of less area than this, px^2, cover nothing.
 _FLAT = 1e-12
+# Bits of fractions of a pixel in what OpenCV draws, and the farthest place in them.
+_SHIFT, _FAR = 4, 2**20
 
 
 def draw_faces(
@@ -46,16 +49,9 @@ def draw_faces(
 
 
 def draw_silhouette(pixels: np.ndarray, faces: np.ndarray, size: int) -> np.ndarray:
-    """Draw the area that a mesh covers: pixels whose centre lies in a triangle.
+    """Draw the area that a mesh covers, (size, size) uint8, 255 where a pixel's centre is in it.
 
-    Args:
-        pixels: (V, 2) vertices in the image, px; pixel centres at +0.5.
-        faces: (F, 3) int, either orientation.
-        size: edge of the square image, px.
-
-    Returns:
-        (size, size) uint8, 255 where the mesh is. Triangles with a corner that is not finite
-        are left out.
+    Vertices are (V, 2) px. Triangles with a corner that is not finite are left out.
     """
     face, _ = draw_faces(pixels, np.ones(len(pixels)), faces, (size, size))
     return np.where(face >= 0, 255, 0).astype(np.uint8)
@@ -64,20 +60,42 @@ def draw_silhouette(pixels: np.ndarray, faces: np.ndarray, size: int) -> np.ndar
 def mix_corners(
     values: np.ndarray, faces: np.ndarray, face: np.ndarray, mix: np.ndarray
 ) -> np.ndarray:
-    """Interpolate values of the vertices at points of the surface.
+    """Interpolate values of the vertices (V, C) at P points of the surface: (P, C) float32.
 
-    Args:
-        values: (V, C) float.
-        faces: (T, 3) int.
-        face: (P,) which face each point is on.
-        mix: (P, 2) barycentric coordinates as `draw_faces` returns them.
-
-    Returns:
-        (P, C) float32.
+    `face` (P,) and `mix` (P, 2) are as `draw_faces` returns them.
     """
     result = np.empty((len(face), values.shape[1]), dtype=np.float32)
     _mix(np.ascontiguousarray(values, dtype=np.float32), faces, face, mix, result)
     return result
+
+
+def fixed_point(pixels: np.ndarray) -> tuple[list[tuple[int, int]], int]:
+    """Places (P, 2) px as OpenCV draws them: whole numbers, pixel centres at 0, and its `shift`.
+
+    What is far off or NaN is drawn outside of every image.
+    """
+    scaled = np.nan_to_num((pixels - 0.5) * 2**_SHIFT, nan=_FAR)
+    return [(x, y) for x, y in np.clip(scaled, -_FAR, _FAR).round().astype(int).tolist()], _SHIFT
+
+
+def draw_bones(canvas: np.ndarray, landmarks: np.ndarray, colour: tuple[int, int, int]) -> None:
+    """Draw the bones between 21 landmarks, (21, 2) px, into an image (H, W, 3) uint8."""
+    import cv2
+
+    places, shift = fixed_point(landmarks)
+    for first, last in LANDMARK_EDGES:
+        cv2.line(canvas, places[first], places[last], colour, 1, cv2.LINE_AA, shift)
+
+
+def draw_dots(
+    canvas: np.ndarray, points: np.ndarray, colour: tuple[int, int, int], radius: float
+) -> None:
+    """Draw discs at points (P, 2) px, with a radius in px, into an image (H, W, 3) uint8."""
+    import cv2
+
+    places, shift = fixed_point(points)
+    for place in places:
+        cv2.circle(canvas, place, round(radius * 2**shift), colour, -1, cv2.LINE_AA, shift)
 
 
 def overlap(first: np.ndarray, second: np.ndarray) -> float:

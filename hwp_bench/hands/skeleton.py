@@ -12,21 +12,7 @@ from hwp_bench.base.errors import BadHandModel, BadInput
 #: Joint names in MANO's order, which every template here uses.
 JOINT_NAMES = (
     "wrist",
-    "index1",
-    "index2",
-    "index3",
-    "middle1",
-    "middle2",
-    "middle3",
-    "little1",
-    "little2",
-    "little3",
-    "ring1",
-    "ring2",
-    "ring3",
-    "thumb1",
-    "thumb2",
-    "thumb3",
+    *(f"{finger}{k}" for finger in ("index", "middle", "little", "ring", "thumb") for k in "123"),
 )
 #: Parent of each joint; the wrist is the root (-1).
 PARENTS = (-1, 0, 1, 2, 0, 4, 5, 0, 7, 8, 0, 10, 11, 0, 13, 14)
@@ -38,20 +24,22 @@ SHAPE_COUNT = 10
 FINGERS = ("thumb", "index", "middle", "ring", "little")
 #: Side names; the right hand is the one that templates are built from.
 SIDES = ("right", "left")
-# Rows of [16 joints, 5 tips] in OpenPose order: wrist, then thumb to little, base to tip.
-_LANDMARKS = (0, 13, 14, 15, 16, 1, 2, 3, 17, 4, 5, 6, 18, 10, 11, 12, 19, 7, 8, 9, 20)
+
+
+#: Pairs of landmarks that a drawing connects.
+LANDMARK_EDGES = (
+    *((0, 4 * finger + 1) for finger in range(5)),
+    *((4 * finger + k, 4 * finger + k + 1) for finger in range(5) for k in (1, 2, 3)),
+)
 
 
 def landmark_order() -> tuple[int, ...]:
     """Rows of [16 joints, 5 finger tips] that make the 21 landmarks of OpenPose and MediaPipe.
 
-    Returns:
-        21 indices: `concatenate([joints, tips])[landmark_order()]` is wrist, thumb (4), index
-        (4), middle (4), ring (4), little (4), each finger from its base to its tip.
-
-    Source: the 21-point hand of OpenPose, which MediaPipe and InterHand's users share.
+    `concatenate([joints, tips])[landmark_order()]` is the wrist, then thumb, index, middle, ring
+    and little finger, each from its base to its tip.
     """
-    return _LANDMARKS
+    return (0, 13, 14, 15, 16, 1, 2, 3, 17, 4, 5, 6, 18, 10, 11, 12, 19, 7, 8, 9, 20)
 
 
 def finger_joints(finger: str) -> tuple[int, int, int]:
@@ -81,11 +69,7 @@ class PalmDirections:
 
 
 def palm_directions(joints: np.ndarray, side: str) -> PalmDirections:
-    """Find the directions of a hand's palm.
-
-    Args:
-        joints: (16, 3) rest joints, MANO order.
-    """
+    """Find the directions of the palm of a hand with rest joints (16, 3)."""
     index, middle, little = (
         JOINT_NAMES.index(f"{name}1") for name in ("index", "middle", "little")
     )
@@ -103,9 +87,8 @@ def unit(vectors: np.ndarray) -> np.ndarray:
     """(..., 3) vectors scaled to length one."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     if length.min() < 1e-9:
-        raise BadHandModel(
-            "two joints, or a finger and the palm's normal, coincide", field="joints"
-        )
+        said = "two joints, or a finger and the palm's normal, coincide"
+        raise BadHandModel(said, field="joints")
     return vectors / length
 
 
@@ -142,18 +125,16 @@ class HandParameters:
             array = np.asarray(getattr(self, field))
             if array.shape != shape:
                 raise BadInput(f"shape is {array.shape}, expected {shape}", field=field)
-            if field == "valid":
-                if array.dtype != np.bool_:
-                    raise BadInput(f"type is {array.dtype}, expected bool", field=field)
-                continue
-            if array.dtype.kind not in "fiu":
-                raise BadInput(f"type is {array.dtype}, expected numbers", field=field)
-            object.__setattr__(self, field, array.astype(np.float64))
-        valid = np.array(self.valid)
-        object.__setattr__(self, "valid", valid)
+            kinds, wanted = ("b", "bool") if field == "valid" else ("fiu", "numbers")
+            if array.dtype.kind not in kinds:
+                raise BadInput(f"type is {array.dtype}, expected {wanted}", field=field)
+            # Both copy.
+            array = np.array(array) if field == "valid" else array.astype(np.float64)
+            object.__setattr__(self, field, array)
+        hidden = ~self.valid
         for field in ("pose", "transl"):
             array = getattr(self, field)
-            array[~valid] = np.nan_to_num(array[~valid], nan=0.0, posinf=0.0, neginf=0.0)
+            array[hidden] = np.nan_to_num(array[hidden], nan=0.0, posinf=0.0, neginf=0.0)
         for field in ("pose", "betas", "transl"):
             bad = ~np.isfinite(getattr(self, field))
             if bad.any():

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 
 from hwp_bench.base.errors import BadInput, ShapeMismatch
 from hwp_bench.hands.articulation import axis_angle_to_matrix
-from hwp_bench.hands.skeleton import JOINT_COUNT, SHAPE_COUNT, landmark_order
-from hwp_bench.hands.template import TemplateTensors
+from hwp_bench.hands.skeleton import JOINT_COUNT, SHAPE_COUNT, HandParameters, landmark_order
+from hwp_bench.hands.template import HandTemplate, TemplateTensors
 
 # The joints at each distance from the wrist, one of each finger; every template has this tree.
 _LEVELS = (slice(1, None, 3), slice(2, None, 3), slice(3, None, 3))
@@ -59,8 +60,17 @@ def pose_hand(
     Source: Romero et al., "Embodied Hands" (MANO), equations 2-5; the root joint's rest place
     stays where it is when the hand turns, as in the authors' code.
     """
-    frames = _frame_count(pose, betas, transl)
-    _check_type(template.vertices.dtype, pose=pose, betas=betas, transl=transl)
+    frames, own = pose.shape[0] if pose.dim() else 0, template.vertices.dtype
+    _check_shape("pose", pose, (frames, JOINT_COUNT, 3))
+    _check_shape("betas", betas, (SHAPE_COUNT,) if betas.dim() == 1 else (frames, SHAPE_COUNT))
+    _check_shape("transl", transl, (frames, 3))
+    for field, value in (("pose", pose), ("betas", betas), ("transl", transl)):
+        if value.dtype != own:
+            raise BadInput(
+                f"type is {value.dtype}, that of the template {own}",
+                field=field,
+                remedy="Convert it, or make the template with `to_torch(dtype)`.",
+            )
     if not flat_hand_mean:
         pose = torch.cat([pose[:, :1], pose[:, 1:] + template.mean_pose], dim=1)
     rotations = axis_angle_to_matrix(pose)
@@ -84,6 +94,15 @@ def pose_hand(
         landmarks=torch.cat([points[:, rows] for rows in _landmark_rows()], dim=1),
         transforms=_homogeneous(turns, shifts),
     )
+
+
+def pose_parameters(
+    template: HandTemplate, hand: HandParameters, frames: Sequence[int] | slice = slice(None)
+) -> PosedHand:
+    """Pose a hand in some frames, in float64 and without gradients."""
+    arrays = (hand.pose[frames], hand.betas, hand.transl[frames])
+    with torch.no_grad():
+        return pose_hand(template.to_torch(torch.float64), *map(torch.from_numpy, arrays))
 
 
 @functools.cache
@@ -118,13 +137,9 @@ def project(
         ShapeMismatch: the arguments do not describe the same frames.
     """
     frames = points.shape[0]
-    for field, value, shape in (
-        ("points", points, (frames, *points.shape[1:2], 3)),
-        ("viewmats", viewmats, (frames, 4, 4)),
-        ("Ks", Ks, (frames, 3, 3)),
-    ):
-        if tuple(value.shape) != shape:
-            raise ShapeMismatch(f"shape is {tuple(value.shape)}, expected {shape}", field=field)
+    _check_shape("points", points, (frames, *points.shape[1:2], 3))
+    _check_shape("viewmats", viewmats, (frames, 4, 4))
+    _check_shape("Ks", Ks, (frames, 3, 3))
     in_camera = points @ viewmats[:, :3, :3].mT + viewmats[:, None, :3, 3]
     depth = in_camera[..., 2]
     tiny = torch.finfo(depth.dtype).eps
@@ -150,27 +165,9 @@ def only_fingertips(template: TemplateTensors) -> TemplateTensors:
     )
 
 
-def _frame_count(pose: torch.Tensor, betas: torch.Tensor, transl: torch.Tensor) -> int:
-    frames = pose.shape[0] if pose.dim() else 0
-    shape_of_betas = (SHAPE_COUNT,) if betas.dim() == 1 else (frames, SHAPE_COUNT)
-    for field, value, shape in (
-        ("pose", pose, (frames, JOINT_COUNT, 3)),
-        ("betas", betas, shape_of_betas),
-        ("transl", transl, (frames, 3)),
-    ):
-        if tuple(value.shape) != shape:
-            raise ShapeMismatch(f"shape is {tuple(value.shape)}, expected {shape}", field=field)
-    return frames
-
-
-def _check_type(expected: torch.dtype, **arguments: torch.Tensor) -> None:
-    for field, value in arguments.items():
-        if value.dtype != expected:
-            raise BadInput(
-                f"type is {value.dtype}, that of the template {expected}",
-                field=field,
-                remedy="Convert it, or make the template with `to_torch(dtype)`.",
-            )
+def _check_shape(field: str, value: torch.Tensor, shape: tuple[int, ...]) -> None:
+    if tuple(value.shape) != shape:
+        raise ShapeMismatch(f"shape is {tuple(value.shape)}, expected {shape}", field=field)
 
 
 def _forward_kinematics(

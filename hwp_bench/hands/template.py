@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -65,94 +65,70 @@ class HandTemplate:
     def to_torch(
         self, dtype: torch.dtype | None = None, device: torch.device | str | None = None
     ) -> TemplateTensors:
-        """Return the arrays that posing needs as tensors.
-
-        Args:
-            dtype: floating type; float32 if None.
-            device: where to put them; the CPU if None.
-        """
+        """Return the arrays that posing needs as tensors: of float32, on the CPU, if None."""
         import torch
 
-        dtype = dtype or torch.float32
+        real = dtype or torch.float32
 
-        def real(array: np.ndarray) -> torch.Tensor:
-            return torch.as_tensor(array, dtype=dtype, device=device)
+        def tensor(array: np.ndarray | None) -> torch.Tensor | None:
+            if array is None:
+                return None
+            kind = real if array.dtype.kind == "f" else None
+            return torch.as_tensor(array, dtype=kind, device=device)
 
-        return TemplateTensors(
-            vertices=real(self.vertices),
-            faces=torch.as_tensor(self.faces, device=device),
-            shape_basis=real(self.shape_basis),
-            pose_basis=None if self.pose_basis is None else real(self.pose_basis),
-            joints=real(self.joints),
-            joint_basis=real(self.joint_basis),
-            weights=real(self.weights),
-            mean_pose=real(self.mean_pose.reshape(-1, 3)),
-            fingertips=torch.as_tensor(self.fingertips, device=device),
-        )
+        arrays = {**vars(self), "mean_pose": self.mean_pose.reshape(-1, 3)}
+        names = [part.name for part in fields(TemplateTensors)]
+        return TemplateTensors(**{name: tensor(arrays[name]) for name in names})  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True, eq=False)
 class TemplateTensors:
     """The arrays of a `HandTemplate` that posing reads, on one device and in one type."""
 
-    #: (V, 3) rest vertices, m.
     vertices: torch.Tensor
-    #: (F, 3) int64 vertex indices.
     faces: torch.Tensor
-    #: (V, 3, 10).
     shape_basis: torch.Tensor
-    #: (V, 3, 135) or None.
     pose_basis: torch.Tensor | None
-    #: (16, 3) rest joints, m.
     joints: torch.Tensor
-    #: (16, 3, 10).
     joint_basis: torch.Tensor
-    #: (V, 16).
     weights: torch.Tensor
     #: (15, 3) axis-angle rad.
     mean_pose: torch.Tensor
-    #: (5,) int64.
     fingertips: torch.Tensor
 
 
 def make_template(
-    *,
-    name: str,
-    side: str,
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    shape_basis: np.ndarray,
-    pose_basis: np.ndarray | None,
-    joints: np.ndarray,
-    joint_basis: np.ndarray,
-    weights: np.ndarray,
-    mean_pose: np.ndarray,
-    uv: np.ndarray,
-    face_uv: np.ndarray,
-    fingertips: np.ndarray,
-    where: str | None = None,
+    *, name: str, side: str, where: str | None = None, **given: np.ndarray | None
 ) -> HandTemplate:
-    """Check the parts of a template, fix their types, and compute its digest."""
-    vertices = np.asarray(vertices)
-    count = vertices.shape[0] if vertices.ndim == 2 else 0
-    face_count = np.asarray(faces).shape[0] if np.ndim(faces) else 0
+    """Check the parts of a template, fix their types, and compute its digest.
+
+    `given` are the arrays of `HandTemplate` but `parents`.
+    """
+    count, face_count, places = (
+        len(part) if part is not None and np.ndim(part) else 0
+        for part in (given[field] for field in ("vertices", "faces", "uv"))
+    )
     floats = {
-        "vertices": (vertices, (count, 3)),
-        "shape_basis": (shape_basis, (count, 3, SHAPE_COUNT)),
-        "joints": (joints, (JOINT_COUNT, 3)),
-        "joint_basis": (joint_basis, (JOINT_COUNT, 3, SHAPE_COUNT)),
-        "weights": (weights, (count, JOINT_COUNT)),
-        "mean_pose": (mean_pose, (3 * (JOINT_COUNT - 1),)),
-        "uv": (uv, (np.shape(uv)[0] if np.ndim(uv) else 0, 2)),
+        "vertices": (count, 3),
+        "shape_basis": (count, 3, SHAPE_COUNT),
+        "joints": (JOINT_COUNT, 3),
+        "joint_basis": (JOINT_COUNT, 3, SHAPE_COUNT),
+        "weights": (count, JOINT_COUNT),
+        "mean_pose": (3 * (JOINT_COUNT - 1),),
+        "uv": (places, 2),
     }
-    if pose_basis is not None:
-        floats["pose_basis"] = (pose_basis, (count, 3, POSE_FEATURE_COUNT))
+    if given["pose_basis"] is not None:
+        floats["pose_basis"] = (count, 3, POSE_FEATURE_COUNT)
+    indices = {
+        "faces": ((face_count, 3), count),
+        "face_uv": ((face_count, 3), places),
+        "fingertips": ((5,), count),
+    }
     parts: dict[str, np.ndarray] = {
-        field: _float_part(value, shape, field, where) for field, (value, shape) in floats.items()
+        field: _float_part(given[field], shape, field, where) for field, shape in floats.items()
     }
-    parts["faces"] = _index_part(faces, (face_count, 3), count, "faces", where)
-    parts["face_uv"] = _index_part(face_uv, (face_count, 3), len(parts["uv"]), "face_uv", where)
-    parts["fingertips"] = _index_part(fingertips, (5,), count, "fingertips", where)
+    for field, (shape, limit) in indices.items():
+        parts[field] = _index_part(given[field], shape, limit, field, where)
     if side not in SIDES:
         raise BadHandModel(f"side is {side!r}, not right or left", where=where, field="side")
     sums = parts["weights"].sum(axis=1)
@@ -268,11 +244,8 @@ def subdivide(template: HandTemplate, times: int = 1) -> HandTemplate:
         UsageError: `times` is out of range.
     """
     if not 0 <= times <= MAX_TIMES:
-        raise UsageError(
-            f"{times} subdivisions are not possible",
-            field="times",
-            remedy=f"Use 0 to {MAX_TIMES}.",
-        )
+        said, remedy = f"{times} subdivisions are not possible", f"Use 0 to {MAX_TIMES}."
+        raise UsageError(said, field="times", remedy=remedy)
     if times == 0:
         return template
     arrays = {field: getattr(template, field) for field in _VERTEX_FIELDS}
@@ -305,27 +278,15 @@ def mano_hd(template: HandTemplate) -> HandTemplate:
 
 
 def boundary_vertices(faces: np.ndarray) -> np.ndarray:
-    """Return the vertices on the open end of a mesh (the wrist), sorted.
-
-    Args:
-        faces: (F, 3) int.
-
-    Returns:
-        (N,) int64, the vertices of the edges that belong to one face only.
-    """
+    """Return the vertices on the open end of a mesh (the wrist), (N,) int64, sorted."""
     return np.unique(_open_edges(faces))
 
 
 def open_loops(faces: np.ndarray) -> list[np.ndarray]:
-    """Return the open ends of a mesh, each as the vertices around it.
+    """Return the open ends of a mesh, each as the vertices around it, the longest first.
 
-    Args:
-        faces: (F, 3) int.
-
-    Returns:
-        (L,) int64 for each open end, one neighbour after the other in the direction of the faces'
-        own edges, the longest first; none for a closed mesh. Where more than two open edges meet in
-        a vertex, one of the ways through it is taken.
+    (L,) int64 each, one neighbour after the other in the direction of the faces' own edges. Where
+    more than two open edges meet in a vertex, one of the ways through it is taken.
     """
     following = dict(_open_edges(faces).tolist())
     loops = []
@@ -363,11 +324,7 @@ def _split(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
 def unique_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the edges of a mesh, each once.
 
-    Args:
-        faces: (F, 3) int.
-
-    Returns:
-        (E, 2) edges in sorted order, and for each face the edges ab, bc, ca as (3, F).
+    (E, 2) edges in sorted order, and for each face the edges ab, bc, ca as (3, F).
     """
     ends = np.sort(_directed_edges(faces), axis=1)
     edges, inverse = np.unique(ends, axis=0, return_inverse=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -20,26 +20,26 @@ from hwp_bench.base.console import notice
 from hwp_bench.base.errors import BadInput, UsageError, bounded
 from hwp_bench.base.files import check_is_file, inside, read_json
 from hwp_bench.base.images import is_blank, read_rgb
-from hwp_bench.capture import Cameras, CaptureInfo, identify_hand_model
+from hwp_bench.capture import Cameras
 from hwp_bench.capture.convert import with_one_shape
 from hwp_bench.capture.schema import MAX_FRAMES
 from hwp_bench.hands import HandParameters, HandTemplate, load_template
-from hwp_bench.hands.fitting import FitTargets, fit_hand
+from hwp_bench.hands.fitting import FitTargets
 from hwp_bench.hands.raster import draw_silhouette
+from hwp_bench.hands.skinning import pose_parameters
 from hwp_bench.importers.shared.frames import CropWindows, cut, follow_hands, resample
 from hwp_bench.importers.shared.landmarks import Landmarks
 from hwp_bench.importers.shared.output import (
+    CHOICES,
     ProjectedHand,
-    overlay_sheet,
-    pose_parameters,
+    ReleaseImport,
+    check_choices,
+    fit_free_hand,
     project_hand,
     refuse_existing,
-    sheet_frames,
     write_capture,
 )
 
-#: The hands that can be asked for.
-CHOICES = ("auto", "right", "left", "both")
 #: Fewest frames of a capture.
 FEWEST = 3
 #: Terms of the data set.
@@ -106,38 +106,21 @@ def find_sequence(name: str) -> InterHandSequence:
     return InterHandSequence(int(match.group(2)), match.group(3), match.group(4), match.group(1))
 
 
-@dataclass(frozen=True)
-class InterHandImport:
-    """Choices of an import; checked when made.
+@dataclass(frozen=True, kw_only=True)
+class InterHandImport(ReleaseImport):
+    """Choices of an import, also those of `ReleaseImport`; checked when made."""
 
-    Raises:
-        UsageError: a choice makes no sense.
-    """
-
-    #: MANO file or folder, or None to fit the free hand to the annotated joints.
-    mano: Path | None = None
-    #: Edge of the stored square frames, px.
-    size: int = 256
     #: Frames per second of the annotated frames; the data set comes at 5 and at 30.
     fps: float = 5.0
-    #: The hands that are imported: `right`, `left`, `both`, or `auto`: those that the data set
-    #: says the sequence shows.
+    #: One of `CHOICES`; `auto`: the hands that the data set says the sequence shows.
     side: str = "auto"
-    #: Replace an existing capture.
-    overwrite: bool = False
 
     def __post_init__(self) -> None:
-        if self.side not in CHOICES:
-            raise UsageError(f"must be one of {', '.join(CHOICES)}", field="--side")
-        if not 32 <= self.size <= 2048:
-            raise UsageError("must be 32 to 2048 px", field="--size")
-        if not 0 < self.fps < 1000:
-            raise UsageError("must be above 0 and below 1000", field="--fps")
-
-    @property
-    def model(self) -> str:
-        """The hand model, as `load_template` takes it."""
-        return "anny" if self.mano is None else f"mano:{Path(self.mano).absolute()}"
+        super().__post_init__()
+        check_choices(
+            ("--side", self.side in CHOICES, f"must be one of {', '.join(CHOICES)}"),
+            ("--fps", 0 < self.fps < 1000, "must be above 0 and below 1000"),
+        )
 
 
 # --- Annotations
@@ -158,9 +141,7 @@ class ManoAnnotation:
 
     def select(self, kept: np.ndarray) -> ManoAnnotation:
         """Those of some frames, (F,) bool."""
-        return ManoAnnotation(
-            self.pose[kept], self.shape[kept], self.transl[kept], self.valid[kept]
-        )
+        return ManoAnnotation(*(getattr(self, part.name)[kept] for part in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,44 +199,37 @@ class _Annotations:
         name = f"InterHand2.6M_{self.split}_{kind}.json"
         return self.root / "annotations" / self.split / name
 
-    def of_capture(self, kind: str) -> tuple[Path, dict[str, Any]]:
-        """The file of a kind, and what it says of the sequence's capture."""
-        path, capture = self.path(kind), str(self.sequence.capture)
-        value = read_json(path, max_bytes=MAX_BYTES)
-        found = value.get(capture) if isinstance(value, dict) else None
-        if not isinstance(found, dict):
-            raise BadInput("is missing", where=path, field=capture)
-        return path, found
+    def of_capture(self, kind: str) -> _Record:
+        """What the file of a kind says of the sequence's capture."""
+        whole = _Record(read_json(self.path(kind), max_bytes=MAX_BYTES), self.path(kind))
+        return whole.part(str(self.sequence.capture))
 
     def frames(self) -> list[dict[str, Any]]:
         """The records of the annotated frames of the camera, by frame number."""
         sequence, path = self.sequence, self.path("data")
-        data, where = read_json(path, max_bytes=MAX_BYTES), path.parent
-        if not isinstance(data, dict):
-            raise BadInput("is not a JSON object", where=path)
-        wanted = (str(sequence.capture), sequence.name, sequence.camera)
+        data, where = _Record(read_json(path, max_bytes=MAX_BYTES), path), path.parent
+        named = (str(sequence.capture), sequence.name, str(sequence.camera))
         chosen = {
             image.get("id"): image
-            for image in _objects(data, "images", where)
-            if (str(image.get("capture")), image.get("seq_name"), str(image.get("camera")))
-            == wanted
+            for image in data.objects("images")
+            if (str(image.get("capture")), image.get("seq_name"), str(image.get("camera"))) == named
         }
         types = {
             item.get("image_id"): item.get("hand_type")
-            for item in _objects(data, "annotations", where)
+            for item in data.objects("annotations")
             if item.get("image_id") in chosen
         }
         rows = []
         for key, image in chosen.items():
-            row = {**image, "hand_type": types.get(key)}
-            for name in ("frame_idx", "width", "height"):
-                try:
-                    row[name] = int(row[name])
-                except (KeyError, TypeError, ValueError) as error:
-                    problem = f"image {key} does not have it"
-                    raise BadInput(problem, where=where, field=name) from error
-            if not isinstance(row.get("file_name"), str):
-                raise BadInput(f"image {key} does not have it", where=where, field="file_name")
+            row, field = {**image, "hand_type": types.get(key)}, "file_name"
+            good = isinstance(row.get(field), str)
+            try:
+                for field in ("frame_idx", "width", "height") if good else ():
+                    row[field] = int(row[field])
+            except (KeyError, TypeError, ValueError):
+                good = False
+            if not good:
+                raise BadInput(f"image {key} does not have it", where=where, field=field)
             if row["hand_type"] in ("right", "left", "interacting"):
                 rows.append(row)
         if not 1 <= len(rows) <= MAX_FRAMES:
@@ -266,25 +240,20 @@ class _Annotations:
             )
         rows.sort(key=lambda row: row["frame_idx"])
         if len({row["frame_idx"] for row in rows}) < len(rows):
-            raise BadInput(
-                f"lists a frame of {sequence.name} twice", where=where, field="frame_idx"
-            )
+            said = f"lists a frame of {sequence.name} twice"
+            raise BadInput(said, where=where, field="frame_idx")
         return rows
 
     def camera(self) -> tuple[np.ndarray, np.ndarray]:
         """Intrinsics (3, 3) px, and (4, 4) world to camera, m."""
-        path, capture = self.of_capture("camera")
-        sequence = self.sequence
-
-        def numbers(name: str, *shape: int) -> np.ndarray:
-            table = capture.get(name)
-            value = table.get(sequence.camera) if isinstance(table, dict) else None
-            return _numbers(value, shape, path, f"{sequence.capture}.{name}.{sequence.camera}")
-
-        position, rotation = numbers("campos", 3) / 1000.0, numbers("camrot", 3, 3)
-        focal, centre = numbers("focal", 2), numbers("princpt", 2)
+        capture, camera = self.of_capture("camera"), self.sequence.camera
+        position = capture.part("campos").numbers(camera, (3,)) / 1000.0
+        rotation = capture.part("camrot").numbers(camera, (3, 3))
+        focal = capture.part("focal").numbers(camera, (2,))
+        centre = capture.part("princpt").numbers(camera, (2,))
         if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-2 or focal.min() <= 0:
-            raise BadInput("is not a rotation, or a focal length is not above 0", where=path)
+            said = "is not a rotation, or a focal length is not above 0"
+            raise BadInput(said, where=capture.path)
         # Written with six digits, it is a rotation only to about 1e-6: take the nearest one.
         left, _, right = np.linalg.svd(rotation)
         viewmat = np.eye(4)
@@ -295,16 +264,14 @@ class _Annotations:
 
     def joints(self, keys: list[str], sides: tuple[str, ...]) -> dict[str, np.ndarray]:
         """(F, 21, 3) m by side."""
-        path, capture = self.of_capture("joint_3d")
+        capture = self.of_capture("joint_3d")
         found = {side: np.full((len(keys), 21, 3), np.nan) for side in sides}
         for index, key in enumerate(keys):
-            frame = capture.get(key)
-            if not isinstance(frame, dict):
+            if not isinstance(capture.value.get(key), dict):
                 continue
-            field = f"{self.sequence.capture}.{key}"
-            coords, valid = frame.get("world_coord"), frame.get("joint_valid")
-            world = _numbers(coords, (42, 3), path, f"{field}.world_coord") / 1000.0
-            flags = _numbers(valid, (42,), path, f"{field}.joint_valid", flat=True)
+            frame = capture.part(key)
+            world = frame.numbers("world_coord", (42, 3)) / 1000.0
+            flags = frame.numbers("joint_valid", (42,), flat=True)
             for side in sides:
                 rows = _FIRST_JOINT[side] + np.array(LANDMARK_ROWS)
                 # Joints that are not valid are filled with ones.
@@ -315,56 +282,62 @@ class _Annotations:
         self, keys: list[str], sides: tuple[str, ...], *, needed: bool
     ) -> dict[str, ManoAnnotation]:
         """MANO parameters by side; none valid if they are not needed and not there."""
-        path = self.path(_MANO)
-        capture: dict[str, Any] = {}
-        if needed or path.exists():
-            path, capture = self.of_capture(_MANO)
+        capture = _Record({}, self.path(_MANO))
+        if needed or capture.path.exists():
+            capture = self.of_capture(_MANO)
         made = {}
         for side in sides:
             pose, shape, transl = (np.zeros((len(keys), n)) for n in (48, 10, 3))
             valid = np.zeros(len(keys), dtype=bool)
             for index, key in enumerate(keys):
-                frame = capture.get(key)
-                hand = frame.get(side) if isinstance(frame, dict) else None
-                if hand is None:
+                frame = capture.value.get(key)
+                if not isinstance(frame, dict) or frame.get(side) is None:
                     continue
-                field = f"{self.sequence.capture}.{key}.{side}"
-                if not isinstance(hand, dict):
-                    raise BadInput("is not a JSON object", where=path, field=field)
+                hand = capture.part(key).part(side)
                 for name, target in (("pose", pose), ("shape", shape), ("trans", transl)):
-                    value, length = hand.get(name), (target.shape[1],)
-                    target[index] = _numbers(value, length, path, f"{field}.{name}", flat=True)
+                    target[index] = hand.numbers(name, (target.shape[1],), flat=True)
                 valid[index] = True
             made[side] = ManoAnnotation(pose.reshape(-1, 16, 3), shape, transl, valid)
         return made
 
 
-def _objects(data: dict[str, Any], name: str, where: Path) -> list[dict[str, Any]]:
-    value = data.get(name)
-    if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
-        raise BadInput("is not a list of objects", where=where, field=name)
-    return value
+class _Record:
+    """A JSON object of a file, and the field that it is."""
 
+    def __init__(self, value: Any, path: Path, field: str | None = None) -> None:
+        if not isinstance(value, dict):
+            raise BadInput("is missing, or not a JSON object", where=path, field=field)
+        self.value, self.path, self._field = value, path, field
 
-def _numbers(
-    value: Any, shape: tuple[int, ...], where: Path, field: str, *, flat: bool = False
-) -> np.ndarray:
-    try:
-        array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise BadInput("is not a list of numbers", where=where, field=field) from error
-    array = array.reshape(-1) if flat else array
-    if array.shape != shape or not np.isfinite(array).all():
-        raise BadInput(f"is not a finite array of shape {shape}", where=where, field=field)
-    return array
+    def part(self, name: str) -> _Record:
+        """A JSON object in it."""
+        return _Record(self.value.get(name), self.path, self._place(name))
+
+    def objects(self, name: str) -> list[dict[str, Any]]:
+        """A list of JSON objects in it."""
+        value = self.value.get(name)
+        if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
+            raise BadInput("is not a list of objects", where=self.path, field=self._place(name))
+        return value
+
+    def numbers(self, name: str, shape: tuple[int, ...], *, flat: bool = False) -> np.ndarray:
+        """Numbers in it."""
+        where, field = self.path, self._place(name)
+        try:
+            array = np.asarray(self.value.get(name), dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise BadInput("is not a list of numbers", where=where, field=field) from error
+        array = array.reshape(-1) if flat else array
+        if array.shape != shape or not np.isfinite(array).all():
+            raise BadInput(f"is not a finite array of shape {shape}", where=where, field=field)
+        return array
+
+    def _place(self, name: str) -> str:
+        return name if self._field is None else f"{self._field}.{name}"
 
 
 def read_annotations(
-    root: str | os.PathLike[str],
-    sequence: InterHandSequence,
-    side: str = "auto",
-    *,
-    mano: bool = True,
+    root: str | os.PathLike[str], sequence: InterHandSequence, side: str, *, mano: bool
 ) -> InterHandRecords:
     """Read the annotations of one camera of one sequence.
 
@@ -387,21 +360,17 @@ def read_annotations(
         )
     sides = tuple(side for side in wanted if side in shown)
     sizes = {(row["width"], row["height"]) for row in rows}
-    if len(sizes) != 1 or not sides:
-        raise BadInput(
-            f"has frames of sizes {sorted(sizes)} and hands {sorted(types)}", where=files.images
-        )
-    K, viewmat = files.camera()
+    if len(sizes) != 1:
+        raise BadInput(f"has frames of sizes {sorted(sizes)}", where=files.images)
     frames = np.array([row["frame_idx"] for row in rows])
     keys = [str(frame) for frame in frames]
     return InterHandRecords(
-        split=files.split,
-        frames=frames,
-        images=images,
-        size=sizes.pop(),
-        sides=sides,
-        K=K,
-        viewmat=viewmat,
+        files.split,
+        frames,
+        images,
+        sizes.pop(),
+        sides,
+        *files.camera(),
         joints=files.joints(keys, sides),
         mano=files.mano(keys, sides, needed=mano),
     )
@@ -429,14 +398,7 @@ def import_interhand(
     hands: dict[str, HandParameters] = {}
     errors: dict[str, dict[str, Any]] = {}
     for side, template in templates.items():
-        errors[side] = {}
-        if options.mano is not None:
-            hands[side], one_shape = _mano_hand(records.mano[side], template, side, root)
-            errors[side] = {"one_shape_mm": round(float(np.nanmean(one_shape)), 3)}
-        else:
-            hands[side] = _free_hand(records, template, side, root)
-        distance = _joint_distance(records.joints[side], template, hands[side])
-        errors[side] |= {"joints_mm": distance, "frames_valid": int(hands[side].valid.sum())}
+        hands[side], errors[side] = _import_hand(records, template, options, root)
     viewmats = np.tile(records.viewmat, (count, 1, 1))
 
     def projected(Ks: np.ndarray) -> list[ProjectedHand]:
@@ -447,21 +409,31 @@ def import_interhand(
     cameras = Cameras(windows.intrinsics(records.K), viewmats)
     clips = projected(cameras.Ks)
     facts |= {"errors": errors, "crop_px": windows.side, "split": records.split}
-    info = _info(records, sequence, facts, options)
-    shown = set(sheet_frames(count))
-    images: dict[int, np.ndarray] = {}
-    masks: dict[int, np.ndarray] = {}
-
-    def frames() -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        for frame, (image, mask) in enumerate(_cropped_frames(records, clips, windows)):
-            if frame in shown:
-                images[frame], masks[frame] = image, mask
-            yield image, mask
-
-    def sheet() -> np.ndarray:
-        return overlay_sheet(clips, images, masks)
-
-    write_capture(out, info, hands, cameras, frames(), sheet, facts, overwrite=options.overwrite)
+    write_capture(
+        out,
+        hands,
+        cameras,
+        _cropped_frames(records, clips, windows),
+        clips,
+        facts,
+        overwrite=options.overwrite,
+        model=options.model,
+        size=options.size,
+        id=sequence.id,
+        action=sequence.name,
+        device=f"InterHand2.6M camera {sequence.camera}",
+        fps=options.fps,
+        perturbations={},
+        source={
+            "kind": "InterHand2.6M",
+            "sequence": f"{records.split}/{sequence.folder}",
+            "camera": sequence.camera,
+            "frames": records.frames.tolist(),
+            "masks": "silhouette of the annotated hands",
+            "import": facts,
+        },
+        licence=LICENCE,
+    )
     return facts
 
 
@@ -486,48 +458,42 @@ def _without_black_frames(
     return records.select(kept), black
 
 
-def _no_annotation(what: str, side: str, root: str | os.PathLike[str]) -> BadInput:
-    other = "left" if side == "right" else "right"
-    return BadInput(
-        f"the {side} hand has no {what} in any frame",
-        where=root,
-        remedy=f"Import the other hand alone: --side {other}.",
-    )
-
-
-def _mano_hand(
-    mano: ManoAnnotation, template: HandTemplate, side: str, root: str | os.PathLike[str]
-) -> tuple[HandParameters, np.ndarray]:
-    """MANO as annotated: relative to the mean pose, each hand with its own model."""
-    if not mano.valid.any():
-        raise _no_annotation("MANO parameters", side, root)
-    pose = mano.pose.copy()
-    pose[:, 1:] += template.mean_pose.reshape(15, 3)
-    return with_one_shape(template, pose, mano.shape, mano.transl, mano.valid)
-
-
-def _free_hand(
-    records: InterHandRecords, template: HandTemplate, side: str, root: str | os.PathLike[str]
-) -> HandParameters:
-    joints = records.joints[side]
-    # A hand is placed by its wrist and knuckles; without them it cannot be placed.
-    valid = np.isfinite(joints[:, [0, 5, 9, 17]]).all(axis=(1, 2))
+def _import_hand(
+    records: InterHandRecords,
+    template: HandTemplate,
+    options: InterHandImport,
+    root: str | os.PathLike[str],
+) -> tuple[HandParameters, dict[str, Any]]:
+    """Take MANO over as annotated, or fit the free hand to the joints; with its errors."""
+    side = template.side
+    mano, joints = records.mano[side], records.joints[side]
+    what, valid = "MANO parameters", mano.valid
+    if options.mano is None:
+        # A hand is placed by its wrist and knuckles; without them it cannot be placed.
+        what, valid = "joints", np.isfinite(joints[:, [0, 5, 9, 17]]).all(axis=(1, 2))
     if not valid.any():
-        raise _no_annotation("joints", side, root)
-    mano = records.mano[side]
-    pose = np.where(mano.valid[:, None, None], mano.pose, 0.0)
-    unplaced = HandParameters(pose, np.zeros(10), np.zeros((len(pose), 3)), valid)
-    shift = joints[:, 9] - pose_parameters(template, unplaced).landmarks[:, 9].numpy()
-    start = replace(unplaced, transl=np.where(valid[:, None], shift, 0.0))
-    return fit_hand(template, FitTargets(joints), start).parameters
-
-
-def _joint_distance(
-    joints: np.ndarray, template: HandTemplate, hand: HandParameters
-) -> float | None:
+        other = "left" if side == "right" else "right"
+        raise BadInput(
+            f"the {side} hand has no {what} in any frame",
+            where=root,
+            remedy=f"Import the other hand alone: --side {other}.",
+        )
+    errors = {}
+    if options.mano is not None:
+        # Relative to the mean pose, each hand with its own model.
+        pose = mano.pose.copy()
+        pose[:, 1:] += template.mean_pose.reshape(15, 3)
+        hand, one_shape = with_one_shape(template, pose, mano.shape, mano.transl, valid)
+        errors["one_shape_mm"] = round(float(np.nanmean(one_shape)), 3)
+    else:
+        pose = np.where(mano.valid[:, None, None], mano.pose, 0.0)
+        targets = FitTargets(joints)
+        hand = fit_free_hand(template, pose, valid, joints[:, 9], targets).parameters
     posed = pose_parameters(template, hand).landmarks.numpy()
     gaps = np.linalg.norm(posed - joints, axis=-1)[hand.valid]
-    return round(1000.0 * float(np.nanmean(gaps)), 3) if np.isfinite(gaps).any() else None
+    known = np.isfinite(gaps).any()
+    distance = round(1000.0 * float(np.nanmean(gaps)), 3) if known else None
+    return hand, {**errors, "joints_mm": distance, "frames_valid": int(hand.valid.sum())}
 
 
 def _windows(clips: list[ProjectedHand], options: InterHandImport) -> CropWindows:
@@ -541,36 +507,6 @@ def _windows(clips: list[ProjectedHand], options: InterHandImport) -> CropWindow
     image = np.concatenate(points, axis=1)
     hand = Landmarks(image, np.zeros((len(image), 21, 3)), seen.astype(float), seen)
     return follow_hands([hand], options.fps, options.size)
-
-
-def _info(
-    records: InterHandRecords,
-    sequence: InterHandSequence,
-    facts: Mapping[str, Any],
-    options: InterHandImport,
-) -> CaptureInfo:
-    shown = "both" if len(records.sides) == 2 else records.sides[0]
-    return CaptureInfo(
-        id=sequence.id,
-        hands=shown,
-        action=sequence.name,
-        device=f"InterHand2.6M camera {sequence.camera}",
-        fps=options.fps,
-        width=options.size,
-        height=options.size,
-        frame_count=len(records.frames),
-        hand_model=identify_hand_model(options.model, shown),
-        perturbations={},
-        source={
-            "kind": "InterHand2.6M",
-            "sequence": f"{records.split}/{sequence.folder}",
-            "camera": sequence.camera,
-            "frames": records.frames.tolist(),
-            "masks": "silhouette of the annotated hands",
-            "import": dict(facts),
-        },
-        licence=LICENCE,
-    )
 
 
 def _cropped_frames(

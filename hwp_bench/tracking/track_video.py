@@ -15,7 +15,8 @@ import numpy as np
 from hwp_bench.base.console import progress
 from hwp_bench.base.drawing import labelled, sheet
 from hwp_bench.base.errors import HwpError, UsageError
-from hwp_bench.importers.shared.landmarks import LANDMARK_EDGES, HandTracks, write_hand_tracks
+from hwp_bench.hands.raster import draw_bones, draw_dots
+from hwp_bench.importers.shared.landmarks import HandTracks, write_hand_tracks
 from hwp_bench.importers.video.decode import (
     FrameRange,
     Reading,
@@ -24,7 +25,7 @@ from hwp_bench.importers.video.decode import (
     read_frames,
     warn_of_damage,
 )
-from hwp_bench.tracking.networks import HandNetworks, LiteRtNetworks, load_models
+from hwp_bench.tracking.networks import LiteRtNetworks, load_models
 from hwp_bench.tracking.tracker import Collected, HandTracker, TrackerSettings
 
 
@@ -78,14 +79,13 @@ def track_video(
     settings: TrackerSettings | None = None,
     model: Path | None = None,
     overwrite: bool = False,
-    networks: HandNetworks | None = None,
+    networks: LiteRtNetworks | None = None,
 ) -> TrackedVideo:
     """Track the hands of a video and write their landmarks.
 
     Args:
         video: any file that `hwp_bench.importers.video.decode` reads, not mirrored.
-        out: `.npz` to write (`hand_tracks` describes it); the importer reads it.
-        settings: thresholds; the defaults where None.
+        out: `.npz` to write; the importer reads it.
         model: file or folder of the networks; None takes the cache, or downloads them once.
         overwrite: replace an existing file.
         networks: to run in place of the model.
@@ -126,7 +126,7 @@ def track_video(
 
 def track_frames(
     frames: Iterable[np.ndarray],
-    networks: HandNetworks,
+    networks: LiteRtNetworks,
     settings: TrackerSettings,
     update: Any = None,
 ) -> Collected:
@@ -143,27 +143,23 @@ def track_frames(
 
 #: Colours of a right and a left hand.
 COLOURS = {"right": (255, 160, 0), "left": (60, 200, 255)}
-#: Frames in a row of the sheet.
-_COLUMNS = 4
-_SHIFT = 4
+# Frames on the sheet and in a row of it, and the longer side of each, px.
+_COUNT, _COLUMNS, _EDGE = 16, 4, 320
 
 
-def landmark_sheet(tracked: TrackedVideo, *, count: int = 16, edge: int = 320) -> np.ndarray:
-    """Draw `count` frames, evenly spaced over a video, with their hands: (H, W, 3) uint8.
-
-    `edge` is the longer side of each frame, px.
-    """
+def landmark_sheet(tracked: TrackedVideo) -> np.ndarray:
+    """Draw frames, evenly spaced over a video, with their hands: (H, W, 3) uint8."""
     frames = tracked.hands.score.shape[1]
-    stride = -(-frames // count)
+    stride = -(-frames // _COUNT)
     left, top, right, bottom = _window(tracked.hands)
     tiles: list[np.ndarray] = []
     for index, frame in read_frames(tracked.video, FrameRange(stride=stride)):
-        if index < frames and len(tiles) < count:
+        if index < frames and len(tiles) < _COUNT:
             part = np.ascontiguousarray(frame[top:bottom, left:right])
-            scale = edge / max(part.shape[:2])
+            scale = _EDGE / max(part.shape[:2])
             part = cv2.resize(part, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-            drawn = draw_landmarks(part, tracked.hands, index, (left, top), scale)
-            tiles.append(labelled(drawn, str(index)))
+            _draw_landmarks(part, tracked.hands, index, (left, top), scale)
+            tiles.append(labelled(part, str(index)))
     return sheet(tiles, _COLUMNS)
 
 
@@ -179,21 +175,15 @@ def _window(hands: HandTracks) -> tuple[int, int, int, int]:
     return int(low[0]), int(low[1]), int(high[0]), int(high[1])
 
 
-def draw_landmarks(
+def _draw_landmarks(
     image: np.ndarray, hands: HandTracks, frame: int, corner: tuple[int, int], scale: float
-) -> np.ndarray:
-    """Draw the hands of a frame on a part of it, (H, W, 3) uint8, which is returned.
+) -> None:
+    """Draw the hands of a frame on a part of it, (H, W, 3) uint8.
 
     `corner` is the part's upper left corner in the frame, px; `scale` the image's, relative to it.
     """
     for hand in range(len(hands.score)):
-        if not hands.seen(hand)[frame]:
-            continue
-        colour = COLOURS[hands.side(hand)]
-        points = (hands.image[hand, frame, :, :2] - corner) * scale - 0.5
-        places = [tuple(int(v) for v in point) for point in np.round(points * 2**_SHIFT)]
-        for start, end in LANDMARK_EDGES:
-            cv2.line(image, places[start], places[end], colour, 1, cv2.LINE_AA, _SHIFT)
-        for place in places:
-            cv2.circle(image, place, 2 << _SHIFT, colour, -1, cv2.LINE_AA, _SHIFT)
-    return image
+        if hands.seen(hand)[frame]:
+            points = (hands.image[hand, frame, :, :2] - corner) * scale
+            draw_bones(image, points, COLOURS[hands.side(hand)])
+            draw_dots(image, points, COLOURS[hands.side(hand)], 2.0)

@@ -15,8 +15,9 @@ import numpy as np
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.importers.shared.landmarks import HandTracks
-from hwp_bench.tracking.detection import (
+from hwp_bench.tracking.networks import (
     HAND_EDGE,
+    LiteRtNetworks,
     Region,
     SeenHand,
     cut_region,
@@ -26,7 +27,6 @@ from hwp_bench.tracking.detection import (
     place_in_image,
     suppress,
 )
-from hwp_bench.tracking.networks import HandNetworks
 
 #: Two regions with more overlap than this show one hand.
 _SAME_REGION = 0.5
@@ -65,14 +65,9 @@ class TrackedHand:
 
 
 class HandTracker:
-    """Follows hands through consecutive frames.
+    """Follows hands through consecutive frames."""
 
-    Args:
-        networks: find palms and landmarks.
-        settings: thresholds.
-    """
-
-    def __init__(self, networks: HandNetworks, settings: TrackerSettings | None = None) -> None:
+    def __init__(self, networks: LiteRtNetworks, settings: TrackerSettings | None = None) -> None:
         self._networks = networks
         self._settings = settings or TrackerSettings()
         self._followed: list[TrackedHand] = []
@@ -93,8 +88,13 @@ class HandTracker:
             moved = np.inf if before is None else _distance(hand, before.hand)
             track = -1 if before is None else before.track
             seen.append((TrackedHand(track, hand), moved))
-        found = _without_doubles(seen)[: self._settings.hands]
-        self._followed = [self._numbered(hand) for hand in found]
+        self._followed = []
+        for one in _without_doubles(seen)[: self._settings.hands]:
+            number = one.track
+            if number < 0:
+                # A new track.
+                number, self._tracks = self._tracks, self._tracks + 1
+            self._followed.append(TrackedHand(number, one.hand))
         return list(self._followed)
 
     def _regions(self, frame: np.ndarray) -> list[tuple[Region, TrackedHand | None]]:
@@ -117,13 +117,6 @@ class HandTracker:
         palms = suppress(decode(values, logits, self._settings.min_palm_score))
         regions = [place_in_image(palm, width, height).hand_region() for palm in palms]
         return [region for region in regions[: self._settings.hands] if _is_sound(region, frame)]
-
-    def _numbered(self, hand: TrackedHand) -> TrackedHand:
-        """The hand, with a new track if it has none."""
-        if hand.track >= 0:
-            return hand
-        self._tracks += 1
-        return TrackedHand(self._tracks - 1, hand.hand)
 
 
 def _without_doubles(seen: list[tuple[TrackedHand, float]]) -> list[TrackedHand]:
@@ -183,31 +176,25 @@ class Collected:
     """Everything that the tracker saw, in the order of the frames; 600 bytes for each hand."""
 
     def __init__(self) -> None:
-        self._frame: list[int] = []
-        self._track: list[int] = []
-        self._image: list[np.ndarray] = []
-        self._world: list[np.ndarray] = []
-        self._scores: list[tuple[float, float]] = []
+        # Frame, track, landmarks in the image and in space, presence, right.
+        self._rows: list[tuple[int, int, np.ndarray, np.ndarray, float, float]] = []
         self.frames = 0
 
     def add(self, hands: Sequence[TrackedHand]) -> None:
         """Take the hands of the next frame."""
         for one in hands:
-            self._frame.append(self.frames)
-            self._track.append(one.track)
-            self._image.append(one.hand.image.astype(np.float32))
-            self._world.append(one.hand.world.astype(np.float32))
-            self._scores.append((one.hand.presence, one.hand.right))
+            image, world = one.hand.image.astype(np.float32), one.hand.world.astype(np.float32)
+            scores = (one.hand.presence, one.hand.right)
+            self._rows.append((self.frames, one.track, image, world, *scores))
         self.frames += 1
 
     def hands(self, size: tuple[int, int], most: int) -> HandTracks | None:
         """Join the tracks to 1 or 2 (`most`) hands; None where nothing was seen. `size`: px."""
-        if not self._frame:
+        if not self._rows:
             return None
-        frame, track = np.array(self._frame), np.array(self._track, dtype=np.int32)
-        scores = np.clip(np.array(self._scores, dtype=np.float32), 0, 1)
-        image, world = np.stack(self._image), np.stack(self._world)
-        owner = _owners(frame, track, scores[:, 1], most)
+        frame, track, image, world, score, right = map(np.array, zip(*self._rows, strict=True))
+        score, right = (np.clip(part.astype(np.float32), 0, 1) for part in (score, right))
+        owner = _owners(frame, track, right, most)
         count = int(owner.max()) + 1
         shape = (count, self.frames)
         made = HandTracks(
@@ -221,7 +208,7 @@ class Collected:
         kept = owner >= 0
         place = owner[kept], frame[kept]
         made.image[place], made.world[place] = image[kept], world[kept]
-        made.score[place], made.right[place] = scores[kept, 0], scores[kept, 1]
+        made.score[place], made.right[place] = score[kept], right[kept]
         made.track[place] = track[kept]
         return made
 
@@ -237,7 +224,10 @@ def _owners(frame: np.ndarray, track: np.ndarray, right: np.ndarray, most: int) 
     lengths = [sum(len(one.frames) for one in side) for side in sides]
     first, second = sides if lengths[0] >= lengths[1] else sides[::-1]
     if most == 1 or min(lengths) < _SECOND_HAND * max(lengths):
-        first, second = _joined(first, second), []
+        # Tracks of the second fill frames in which the first is not seen.
+        taken = {frame for one in first for frame in one.frames.tolist()}
+        spare = [one for one in second if taken.isdisjoint(one.frames.tolist())]
+        first, second = [*first, *spare], []
     owner = np.full(len(frame), -1)
     for hand, side in enumerate((first, second)):
         for one in side:
@@ -261,9 +251,3 @@ def _by_side(tracks: list[_Track]) -> tuple[list[_Track], list[_Track]]:
                 taken[side].update(frames)
                 break
     return sides
-
-
-def _joined(first: list[_Track], second: list[_Track]) -> list[_Track]:
-    """One hand of two sides: tracks of the second fill frames in which the first is not seen."""
-    taken = {frame for one in first for frame in one.frames.tolist()}
-    return [*first, *(one for one in second if taken.isdisjoint(one.frames.tolist()))]

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from fitted_parts import batch_of, material_of, scores_of
 from formed import drawn, formed_capture, over, train_frames, training_of
 from painted import (
     FRAMES,
@@ -16,20 +17,16 @@ from painted import (
     SilentReport,
     TrainingMaker,
     hand_parameters,
-    masked_psnr,
     painted_avatar,
 )
 from scipy.spatial.transform import Rotation
 
-from exposure_fit.method import ExposureMethod, ExposureRecipe
-from exposure_fit.motion import motion_px, nearest_turn, pose_velocities, velocities
+from exposure_fit.method import ExposureMethod, ExposureRecipe, motion_px, nearest_turn, velocities
 from hwp_bench.capture import Capture
 from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.methods.contract import Budget, TrainingCapture
 from plain_fit.method import PlainMethod
-from wildghand.gaussians.training import load_frames
 from wildghand.plain.model import PlainAvatar
-from wildghand.plain.recipe import Batch, Material
 
 
 def test_the_nearest_vector_is_the_same_rotation() -> None:
@@ -60,7 +57,7 @@ def test_a_jump_by_a_whole_turn_is_no_motion() -> None:
     axis = np.array([0.6, 0.0, 0.8])
     wrapped = np.where(angles > math.pi, angles - 2.0 * math.pi, angles)
     pose = wrapped[:, None, None] * axis
-    speeds = pose_velocities(pose, np.ones(6, dtype=bool), np.arange(6))
+    speeds = velocities(pose, np.ones(6, dtype=bool), np.arange(6), turns=True)
     np.testing.assert_allclose(speeds, np.broadcast_to(0.1 * axis, (6, 1, 3)), atol=1e-12)
 
 
@@ -130,16 +127,12 @@ def test_an_exposure_is_the_mean_of_its_moments(make_training: TrainingMaker) ->
     """Oracle: each moment drawn alone, from ends that are given."""
     training = make_training()
     method = ExposureMethod({**QUICK, "least_motion": 0.0, "moments": 3})
-    recipe = ExposureRecipe(
-        Material(training, load_frames(training), 0, method.device), method.settings
-    )
+    recipe = ExposureRecipe(material_of(training), method.settings)
     assert recipe.moving.all()
-    row = torch.tensor([4])
-    recipe.ends["transl_right"][4] = torch.tensor([[-0.02, 0.0, 0.0], [0.04, 0.01, 0.0]])
-    recipe.ends["pose_right"][4] = 0.0
-    frames = recipe.material.frames
-    device = method.device
-    batch = Batch(0, 0.0, row, frames.images_on(device)(row), frames.masks_on(device)(row))
+    batch = batch_of(recipe.material, 4)
+    row = batch.rows
+    recipe.ends["transl.right"][4] = torch.tensor([[-0.02, 0.0, 0.0], [0.04, 0.01, 0.0]])
+    recipe.ends["pose.right"][4] = 0.0
     pose, betas, transl = recipe.clip.parameters["right"]
     rig, images = recipe.model.rigs["right"], []
     for moved in ([-0.02, 0.0, 0.0], [0.01, 0.005, 0.0], [0.04, 0.01, 0.0]):
@@ -155,8 +148,7 @@ def test_an_exposure_is_the_mean_of_its_moments(make_training: TrainingMaker) ->
 def test_a_sharp_hand_comes_out_of_blurred_frames(tmp_path: Path) -> None:
     """Training frames are means over up to 6 px; the plain fit must miss by 1 dB at least."""
     training, capture = exposed_training(tmp_path)
-    settings = {**QUICK, "gaussians": 1500, "steps": 250}
-    plain = PlainMethod(settings, 0).fit(training, Budget(), SilentReport())
-    sharp = ExposureMethod({**settings, "shutter": 1.0}, 0).fit(training, Budget(), SilentReport())
-    scores = [masked_psnr(one, training, capture) for one in (plain, sharp)]
+    settings = {**QUICK, "gaussians": 1500, "steps": 150}
+    sharp = ExposureMethod({**settings, "shutter": 1.0}, 0)
+    scores = scores_of(training, capture, PlainMethod(settings, 0), sharp)
     assert scores[1] > scores[0] + 1.0, scores

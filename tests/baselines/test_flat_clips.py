@@ -45,7 +45,7 @@ def test_a_clip_of_one_colour_gives_an_avatar_of_that_colour(
 ) -> None:
     method, settings = METHODS[name]
     training = flat(make_training(), level)
-    avatar = method({**QUICK, **settings, "steps": 60}, 0).fit(training, Budget(), SilentReport())
+    avatar = method({**QUICK, **settings, "steps": 30}, 0).fit(training, Budget(), SilentReport())
     # The avatar of `wild` makes its plain one when it is first drawn.
     model = getattr(avatar, "plain", avatar).model
     for key, value in model.parameters().items():
@@ -58,6 +58,6 @@ def test_a_clip_of_one_colour_gives_an_avatar_of_that_colour(
     truth = np.full((*seen.shape, 3), level, np.uint8)
     scores = score_frame(np.clip(rgba[..., :3], 0.0, 1.0), truth, seen)
     assert all(np.isfinite(value) for value in scores.values()), scores
-    # A fifth of the range: 60 steps from the mean colour, which is the clip's.
+    # A fifth of the range: 30 steps from the mean colour, which is the clip's.
     colour = rgba[seen][:, :3] / rgba[seen][:, 3:]
     assert np.abs(colour - level / 255.0).mean() < 0.2

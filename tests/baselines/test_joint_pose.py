@@ -7,34 +7,27 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from painted import QUICK, SilentReport, TrainingMaker, masked_psnr
+from fitted_parts import batch_of, material_of, scores_of
+from painted import QUICK, TrainingMaker
 
 from hwp_bench.capture import Capture
-from hwp_bench.methods.contract import Budget, TrainingCapture
+from hwp_bench.methods.contract import TrainingCapture
 from joint_pose_fit.method import JointPoseMethod, JointPoseRecipe
 from plain_fit.method import PlainMethod
-from wildghand.gaussians.training import load_frames
-from wildghand.plain.recipe import Batch, Material, PlainRecipe
+from wildghand.plain.recipe import Material, PlainRecipe
 
 
 def materials(
     make_training: TrainingMaker, hands: str = "both"
 ) -> tuple[Material, JointPoseMethod]:
-    training = make_training(hands)
-    method = JointPoseMethod({**QUICK, "hold_weight": 0.5})
-    return Material(training, load_frames(training), 0, method.device), method
-
-
-def batch_of(material: Material, count: int = 2) -> Batch:
-    frames, device, rows = material.frames, material.device, torch.arange(count)
-    return Batch(0, 0.0, rows, frames.images_on(device)(rows), frames.masks_on(device)(rows))
+    return material_of(make_training(hands)), JointPoseMethod({**QUICK, "hold_weight": 0.5})
 
 
 def test_without_corrections_a_frame_is_drawn_as_by_the_plain_fit(
     make_training: TrainingMaker,
 ) -> None:
     material, method = materials(make_training)
-    batch = batch_of(material)
+    batch = batch_of(material, 0, 1)
     ours = JointPoseRecipe(material, method.settings)
     plain = PlainRecipe(material, PlainMethod(QUICK).settings)
     with torch.no_grad():
@@ -46,10 +39,10 @@ def test_corrections_get_gradients_of_their_frames_alone(make_training: Training
     recipe = JointPoseRecipe(material, method.settings)
     for value in recipe.parameters().values():
         value.requires_grad_()
-    batch = batch_of(material)
+    batch = batch_of(material, 0, 1)
     drawing = recipe.draw(batch)
     recipe.loss(batch, drawing, recipe.weights(batch, drawing)).backward()
-    for value in (*recipe.poses.values(), *recipe.places.values()):
+    for value in (*recipe.corrections.poses.values(), *recipe.corrections.places.values()):
         assert value.grad is not None
         assert value.grad[:2].abs().sum() > 0.0
         assert not value.grad[2:].any()
@@ -59,12 +52,12 @@ def test_the_corrections_are_held_by_their_mean_square(make_training: TrainingMa
     """0.1 rad at each angle and 0.02 m = 0.2 dm: 0.5 (0.01 + 0.04) / 2 on top."""
     material, method = materials(make_training, "right")
     recipe = JointPoseRecipe(material, method.settings)
-    batch = batch_of(material)
+    batch = batch_of(material, 0, 1)
     drawing = recipe.draw(batch)
     weights = recipe.weights(batch, drawing)
     before = recipe.loss(batch, drawing, weights)
-    recipe.poses["right"].fill_(0.1)
-    recipe.places["right"].fill_(0.02)
+    recipe.corrections.poses["right"].fill_(0.1)
+    recipe.corrections.places["right"].fill_(0.02)
     added = recipe.loss(batch, drawing, weights) - before
     torch.testing.assert_close(added, torch.tensor(0.5 * (0.01 + 0.04) / 2), atol=1e-6, rtol=1e-4)
 
@@ -86,10 +79,8 @@ def test_wrong_poses_are_corrected(
     """Joints that are 4 degrees off cost the plain fit some 1.6 dB; 0.6 dB must come back."""
     # Faster than by default, since each frame comes five times only.
     settings = {"pose_rate": 3e-3, "transl_rate": 3e-4}
-    scores = {}
-    for method in (PlainMethod, JointPoseMethod):
-        training = with_wrong_poses(make_training(), 4.0)
-        own = settings if method is JointPoseMethod else {}
-        avatar = method({**QUICK, "steps": 150, **own}, 0).fit(training, Budget(), SilentReport())
-        scores[method] = masked_psnr(avatar, training, make_painted("right"))
-    assert scores[JointPoseMethod] > scores[PlainMethod] + 0.6
+    training = with_wrong_poses(make_training(), 4.0)
+    plain = PlainMethod({**QUICK, "steps": 150}, 0)
+    ours = JointPoseMethod({**QUICK, "steps": 150, **settings}, 0)
+    scores = scores_of(training, make_painted("right"), plain, ours)
+    assert scores[1] > scores[0] + 0.6, scores

@@ -8,25 +8,27 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from fitted_parts import batch_of, material_of, scores_of
 from formed import drawn, formed_capture, over, train_frames, training_of
 from painted import (
     QUICK,
     SIZE,
-    SilentReport,
     TrainingMaker,
     hand_parameters,
-    masked_psnr,
     painted_avatar,
 )
 
-from hwp_bench.methods.contract import Budget
-from occluder_splats_fit.method import OccluderMethod, OccluderRecipe
-from occluder_splats_fit.occluders import DISTANCE, FrameOccluders, make_occluders, mask_boxes
+from occluder_splats_fit.method import (
+    DISTANCE,
+    FrameOccluders,
+    OccluderMethod,
+    OccluderRecipe,
+    make_occluders,
+    mask_boxes,
+)
 from plain_fit.method import PlainMethod
-from wildghand.gaussians.training import load_frames
-from wildghand.plain.recipe import Batch, Material
 
-STEPS = 400
+STEPS = 250
 
 
 def test_one_occluder_is_the_gaussian_of_its_numbers() -> None:
@@ -78,15 +80,10 @@ def test_occluders_start_in_their_box_in_the_colours_of_the_frame() -> None:
 @pytest.mark.parametrize("target", ["mask", "box"])
 def test_an_image_is_the_occluders_over_the_hand(make_training: TrainingMaker, target: str) -> None:
     """The drawing against both layers drawn apart; only frames of the batch get a gradient."""
-    training = make_training()
     method = OccluderMethod({**QUICK, "target": target, "occluders": 20})
-    recipe = OccluderRecipe(
-        Material(training, load_frames(training), 0, method.device), method.settings
-    )
-    rows = torch.tensor([3, 7])
-    frames = recipe.material.frames
-    device = method.device
-    batch = Batch(0, 0.0, rows, frames.images_on(device)(rows), frames.masks_on(device)(rows))
+    recipe = OccluderRecipe(material_of(make_training()), method.settings)
+    batch = batch_of(recipe.material, 3, 7)
+    rows = batch.rows
     for value in recipe.parameters().values():
         value.requires_grad_()
     drawing = recipe.draw(batch)
@@ -125,7 +122,5 @@ def test_occluders_are_explained_where_the_plain_fit_takes_them_for_skin(tmp_pat
     capture = formed_capture(tmp_path / "hidden", hand, picture)
     training = training_of(capture, tmp_path / "request")
     settings = {**QUICK, "steps": STEPS}
-    plain = PlainMethod(settings, 0).fit(training, Budget(), SilentReport())
-    peeled = OccluderMethod(settings, 0).fit(training, Budget(), SilentReport())
-    scores = [masked_psnr(one, training, capture) for one in (plain, peeled)]
+    scores = scores_of(training, capture, PlainMethod(settings, 0), OccluderMethod(settings, 0))
     assert scores[1] > scores[0] + 1.0, scores

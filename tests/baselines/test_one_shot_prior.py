@@ -6,28 +6,25 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from fitted_parts import material_of
 from painted import SilentReport, TrainingMaker, masked_psnr
 
 from hwp_bench.capture import Capture
 from hwp_bench.methods.contract import Avatar, Budget, TrainingCapture
 from one_shot_prior_fit.method import (
     HALVED_AFTER,
+    OneShotModel,
     OneShotRecipe,
     OneShotSettings,
     choose_frame,
     only,
 )
-from one_shot_prior_fit.model import OneShotModel
-from wildghand.gaussians.training import TrainingFrames, load_frames
+from wildghand.gaussians.training import TrainingFrames
 from wildghand.plain.loop import run_fit
-from wildghand.plain.recipe import FitSettings, Material, PlainRecipe
+from wildghand.plain.recipe import FitSettings, PlainRecipe
 
 CPU = torch.device("cpu")
 SMALL = OneShotSettings(gaussians=500, steps=3, device="cpu")
-
-
-def material_of(training: TrainingCapture) -> Material:
-    return Material(training, load_frames(training), 0, CPU)
 
 
 def test_one_palm_tells_the_prior_what_the_back_is_like(
@@ -65,7 +62,7 @@ def test_only_map_bias_gain_and_offset_change(make_training: TrainingMaker) -> N
     }
     before = recipe.snapshot()
     run_fit(recipe, Budget(), SilentReport())
-    assert set(before) == {"identity.right", "bias.right", "gain", "offset"}
+    assert set(before) == {"identity.right", "bias.right", "color.gain", "color.offset"}
     for name, value in recipe.parameters().items():
         assert not torch.equal(value, before[name]), name
     now = dict(recipe.fitted.model.named_parameters())
@@ -107,7 +104,7 @@ def test_gain_and_offset_act_on_the_colours_under_the_coverage(
 
 def test_rates_are_halved_after_the_original_s_epochs(make_training: TrainingMaker) -> None:
     recipe = OneShotRecipe(material_of(make_training()), replace(SMALL, decay="halving"))
-    assert recipe.rate("gain", 0.0) == SMALL.color_rate
+    assert recipe.rate("color.gain", 0.0) == SMALL.color_rate
     for count, share in enumerate(HALVED_AFTER):
         assert recipe.rate("identity.right", share - 1e-9) == SMALL.identity_rate * 0.5**count
         assert recipe.rate("bias.right", share) == SMALL.bias_rate * 0.5 ** (count + 1)

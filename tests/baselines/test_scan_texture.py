@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from fitted_parts import material_of, scores_of
 from formed import over, training_of
 from hypothesis import given
 from hypothesis import strategies as st
@@ -17,10 +18,8 @@ from painted import (
     FRAMES,
     QUICK,
     SIZE,
-    SilentReport,
     cameras,
     hand_parameters,
-    masked_psnr,
     painted_avatar,
     painted_info,
     write_drawn,
@@ -30,17 +29,21 @@ from hwp_bench.base.images import as_uint8
 from hwp_bench.capture import Cameras, Capture, CaptureWriter
 from hwp_bench.capture.reader import open_capture
 from hwp_bench.hands.skeleton import HandParameters
-from hwp_bench.methods.contract import Budget
 from plain_fit.method import PlainMethod
-from scan_texture_fit.method import ScanMethod, ScanRecipe, total_variation
-from scan_texture_fit.model import ScanSettings, _two_columns
-from scan_texture_fit.unwrap import nearest_anchor, read_pixels, weighted_median
+from scan_texture_fit.method import (
+    ScanMethod,
+    ScanRecipe,
+    ScanSettings,
+    _two_columns,
+    nearest_anchor,
+    read_pixels,
+    total_variation,
+    weighted_median,
+)
 from wildghand.gaussians.quaternions import quat_third_axis
-from wildghand.gaussians.training import load_frames
-from wildghand.plain.recipe import Material
 
 #: A texture that is fine enough for the small captures of these tests.
-SMALL = {**QUICK, "gaussians": 1500, "texture_size": 64, "steps": 200}
+SMALL = {**QUICK, "gaussians": 1500, "texture_size": 64, "steps": 140}
 
 
 @given(st.integers(1, 9), st.integers(0, 2**31))
@@ -140,20 +143,15 @@ def test_a_lamp_that_moves_with_the_camera_is_a_shadow_of_the_view(tmp_path: Pat
     stays in the world and must miss by 1 dB at least what the shadows of the view explain."""
     capture = headlamp_capture(tmp_path / "lamp", hand_parameters("right", 4))
     training = training_of(capture, tmp_path / "request")
-    scores = [
-        masked_psnr(method.fit(training, Budget(), SilentReport()), training, capture)
-        for method in (
-            PlainMethod({**QUICK, "gaussians": 1500, "steps": 200}, 0),
-            ScanMethod(SMALL, 0),
-        )
-    ]
+    plain = PlainMethod({**QUICK, "gaussians": 1500, "steps": 140}, 0)
+    scores = scores_of(training, capture, plain, ScanMethod(SMALL, 0))
     assert scores[1] > scores[0] + 1.0, scores
 
 
 def made_recipe(capture: Capture, place: Path, **settings: object) -> ScanRecipe:
     training = training_of(capture, place)
     chosen = ScanSettings(**{**SMALL, **settings})  # type: ignore[arg-type]
-    return ScanRecipe(Material(training, load_frames(training), 0, torch.device("cpu")), chosen)
+    return ScanRecipe(material_of(training), chosen)
 
 
 def test_frames_are_unwrapped_into_the_texture_that_they_show(tmp_path: Path) -> None:
@@ -201,7 +199,7 @@ def test_the_texture_waits_for_the_second_stage(tmp_path: Path) -> None:
     capture = headlamp_capture(tmp_path / "any", hand_parameters("right", 4))
     recipe = made_recipe(capture, tmp_path / "a")
     share = recipe.settings.shape_share
-    texture, betas = "hands.right.texture", "hands.right.betas"
+    texture, betas = "texture.right", "betas.right"
     assert recipe.rate(texture, 0.5 * share) == 0.0 < recipe.rate(texture, share)
     assert recipe.rate(betas, share) < 0.2 * recipe.rate(betas, 0.99 * share)
     assert set(recipe.rates()) == set(recipe.parameters())

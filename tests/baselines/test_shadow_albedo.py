@@ -10,25 +10,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from fitted_parts import scores_of
 from formed import formed_capture, over, training_of
 from painted import (
     FRAMES,
     QUICK,
     SIZE,
-    SilentReport,
     cameras,
     hand_parameters,
-    masked_psnr,
     painted_avatar,
 )
 
 from hwp_bench.hands import pose_hand
 from hwp_bench.hands.skeleton import HandParameters
-from hwp_bench.methods.contract import Budget
 from hwp_bench.sim.geometry.rays import Tracer
 from plain_fit.method import PlainMethod
-from shadow_albedo_fit.method import ShadowMethod
-from shadow_albedo_fit.model import ShadowedModel, lamp_cameras, visibility
+from shadow_albedo_fit.method import ShadowedModel, ShadowMethod, lamp_cameras, visibility
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import AnchorPoses, HandRig
 from wildghand.plain.model import PlainModel
@@ -186,12 +183,12 @@ def test_shadows_that_move_with_the_pose_are_predicted(tmp_path: Path) -> None:
         capture = formed_capture(tmp_path / "lit", hand, picture)
     assert capture.info.frame_count == FRAMES
     training = training_of(capture, tmp_path / "request")
-    settings = {**QUICK, "gaussians": 1200, "steps": 300}
-    plain = PlainMethod(settings, 0).fit(training, Budget(), SilentReport())
-    lit = ShadowMethod(settings, 0).fit(training, Budget(), SilentReport())
-    unshaded = ShadowMethod({**settings, "shadows": False}, 0).fit(
-        training, Budget(), SilentReport()
+    settings = {**QUICK, "gaussians": 1200, "steps": 160}
+    methods = (
+        PlainMethod(settings, 0),
+        ShadowMethod(settings, 0),
+        ShadowMethod({**settings, "shadows": False}, 0),
     )
-    scores = [masked_psnr(one, training, capture) for one in (plain, lit, unshaded)]
+    scores = scores_of(training, capture, *methods)
     assert scores[1] > scores[0] + 1.0, scores
     assert scores[1] > scores[2] + 0.5, scores

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from painted import QUICK, SilentReport, TrainingMaker, masked_psnr
+from fitted_parts import material_of, scores_of
+from painted import QUICK, TrainingMaker
 from synthetic_mano import write_mano_folder
 
 from hwp_bench.base.colors import linear_to_srgb
@@ -16,20 +17,25 @@ from hwp_bench.base.errors import BadInput
 from hwp_bench.capture import Capture
 from hwp_bench.hands import load_template
 from hwp_bench.hands.anchors import sample_surface
-from hwp_bench.methods.contract import Budget, TrainingCapture
+from hwp_bench.methods.contract import TrainingCapture
 from hwp_bench.sim.produce.suites import suite, suite_names
 from hwp_bench.sim.scene_files import load_scene
 from plain_fit.method import PlainMethod
-from texture_space_fit import build
-from texture_space_fit.method import SpaceMethod, SpaceRecipe, SpaceSettings
-from texture_space_fit.model import SpaceModel, to_srgb
-from texture_space_fit.skins import FILE, shipped_skins, skin_uv
+from texture_space_fit.method import (
+    FILE,
+    SpaceMethod,
+    SpaceModel,
+    SpaceRecipe,
+    SpaceSettings,
+    shipped_skins,
+    skin_uv,
+    to_srgb,
+)
+from tools import paint_skins as build
 from wildghand.gaussians.rig import make_rig
-from wildghand.gaussians.training import load_frames
-from wildghand.plain.recipe import Material
 
 ROOT = Path(__file__).resolve().parents[2]
-#: SHA-256 of the file that `python -m texture_space_fit.build` wrote.
+#: SHA-256 of the file that `tools/paint_skins.py` wrote.
 DIGEST = "0e261559ab9e1d26a1cd8e8b7f1c9d3c4ebaeabe1e0fd945b7c2e7a62dc759d8"
 
 
@@ -127,8 +133,7 @@ def test_other_hand_models_are_refused(tmp_path: Path) -> None:
 
 
 def test_only_what_is_set_to_be_fitted_is_fitted(make_training: TrainingMaker) -> None:
-    training = make_training("both")
-    material = Material(training, load_frames(training), 0, torch.device("cpu"))
+    material = material_of(make_training("both"))
     small = {"gaussians": 50, "device": "cpu"}
     recipe = SpaceRecipe(material, SpaceSettings(**small))
     assert set(recipe.parameters()) == {"latent", "light", "betas.right", "betas.left"}
@@ -148,9 +153,5 @@ def test_a_palm_tells_the_space_what_the_back_is_like(
     """
     settings = {**QUICK, "gaussians": 1000, "steps": 150}
     plain = PlainMethod({**settings, "shading_degree": 0}, 0)
-    ours = SpaceMethod(settings, 0)
-    scores = [
-        masked_psnr(method.fit(turned_hand, Budget(), SilentReport()), turned_hand, turned)
-        for method in (plain, ours)
-    ]
+    scores = scores_of(turned_hand, turned, plain, SpaceMethod(settings, 0))
     assert scores[1] > scores[0] + 2.0, scores

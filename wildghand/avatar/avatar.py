@@ -8,7 +8,7 @@ import io
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -25,6 +25,7 @@ from wildghand.avatar.studio import REST, Pose, Studio
 from wildghand.gaussians.hand_avatar import HandAvatar, PosedHands
 from wildghand.model.model import WildGHandModel
 from wildghand.model.settings import WildGHandSettings
+from wildghand.splat import rasterize
 from wildghand.splat.threads import denormals_flushed
 
 #: Frames of a turn, and milliseconds of each.
@@ -72,50 +73,26 @@ class InlinePicture:
         return bundle
 
 
-def still(rgba: np.ndarray, background: tuple[int, int, int], text: str) -> InlinePicture:
-    """Return one drawing over a colour.
+def encode(drawn: list[np.ndarray], background: tuple[int, int, int], text: str) -> InlinePicture:
+    """Return one drawing over a colour, or several as a turn: an animated WebP image.
 
     Args:
-        rgba: (H, W, 4) float as `Avatar.render` gives it.
+        drawn: (H, W, 4) float each, as `WildGHandAvatar.render` gives them.
     """
     from PIL import Image
 
-    buffer = io.BytesIO()
-    Image.fromarray(over(rgba, background)).save(buffer, format="PNG")
-    return InlinePicture(buffer.getvalue(), "image/png", rgba.shape[1], text)
-
-
-def turntable(
-    draw: Callable[[float], np.ndarray], background: tuple[int, int, int], text: str
-) -> InlinePicture:
-    """Return a turn as an animated WebP image.
-
-    Args:
-        draw: takes degrees about the vertical, gives (H, W, 4) float as `Avatar.render` does.
-    """
-    from PIL import Image
-
-    turns = [360.0 * frame / TURN_FRAMES for frame in range(TURN_FRAMES)]
-    frames = [Image.fromarray(over(draw(turn), background)) for turn in turns]
-    buffer = io.BytesIO()
-    frames[0].save(
-        buffer,
-        format="WEBP",
-        save_all=True,
-        append_images=frames[1:],
-        duration=TURN_MS,
-        loop=0,
-        quality=_QUALITY,
-    )
-    return InlinePicture(buffer.getvalue(), "image/webp", frames[0].width, text)
+    frames = [Image.fromarray(over(rgba, background)) for rgba in drawn]
+    buffer, media = io.BytesIO(), "image/png" if len(frames) == 1 else "image/webp"
+    if len(frames) == 1:
+        frames[0].save(buffer, format="PNG")
+    else:
+        turn = {"save_all": True, "append_images": frames[1:], "duration": TURN_MS, "loop": 0}
+        frames[0].save(buffer, format="WEBP", quality=_QUALITY, **turn)
+    return InlinePicture(buffer.getvalue(), media, frames[0].width, text)
 
 
 def over(rgba: np.ndarray, background: tuple[int, int, int]) -> np.ndarray:
-    """Return a drawing over a colour: (H, W, 3) uint8.
-
-    Args:
-        rgba: (H, W, 4) float in [0, 1], premultiplied.
-    """
+    """Return a drawing (H, W, 4) in [0, 1], premultiplied, over a colour: (H, W, 3) uint8."""
     behind = (1.0 - rgba[..., 3:]) * (np.array(background, dtype=np.float32) / 255.0)
     return as_uint8(rgba[..., :3] + behind)
 
@@ -142,9 +119,6 @@ _PER_FRAME = Meta(max_length=MAX_FRAMES)
 @dataclass(frozen=True)
 class FitRecord:
     """How an avatar was fitted."""
-
-    #: Fields that old avatars have; they are read and dropped.
-    removed_fields: ClassVar[tuple[str, ...]] = ("loss",)
 
     #: Frames of the capture that were fitted.
     frames: Annotated[list[_Frame], _PER_FRAME] = field(default_factory=list)
@@ -190,12 +164,25 @@ class PosedGaussians:
         for item in fields(self):
             bad = int((~np.isfinite(getattr(self, item.name))).sum())
             if bad:
-                raise BadInput(
-                    f"hold {bad:,} numbers that are NaN or infinite",
-                    field=item.name,
-                    remedy="The avatar is damaged, or a pose or scale is out of range; nothing is "
-                    "written.",
-                )
+                problem = f"hold {bad:,} numbers that are NaN or infinite"
+                remedy = "The avatar is damaged, or a pose or scale is out of range"
+                raise BadInput(problem, field=item.name, remedy=f"{remedy}; nothing is written.")
+
+
+@denormals_flushed()
+@torch.no_grad()
+def splat(posed: PosedGaussians, camera: Camera, device: str = "cpu") -> np.ndarray:
+    """Draw Gaussians as they are: (H, W, 4) float32, as `WildGHandAvatar.render` gives it."""
+    given = (posed.means, posed.quats, posed.scales, posed.opacities, posed.colors)
+    arrays = (*given, camera.viewmat[None], camera.K[None])
+    means, quats, scales, opacities, colors, viewmats, Ks = (
+        torch.as_tensor(each, dtype=torch.float32, device=device) for each in arrays
+    )
+    image, coverage, _ = rasterize(
+        means, quats, scales, opacities, colors, viewmats, Ks, camera.width, camera.height
+    )
+    rgba = torch.cat((image, coverage), dim=-1)[0]
+    return rgba.clamp(0.0, 1.0).nan_to_num(0.0).cpu().numpy()
 
 
 class WildGHandAvatar(HandAvatar):
@@ -244,16 +231,10 @@ class WildGHandAvatar(HandAvatar):
         )
 
     def draw(
-        self,
-        hands: PosedHands,
-        viewmats: torch.Tensor,
-        Ks: torch.Tensor,
-        width: int,
-        height: int,
+        self, hands: PosedHands, viewmats: torch.Tensor, Ks: torch.Tensor, width: int, height: int
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Draw the hands without what perturbed the training frames; see `HandAvatar.draw`."""
-        refine = self.settings.heads
-        return self.model.draw(hands, viewmats, Ks, width, height, refine=refine)
+        return self.model.draw(hands, viewmats, Ks, width, height, refine=self.settings.heads)
 
     @functools.cached_property
     def studio(self) -> Studio:
@@ -308,13 +289,9 @@ class WildGHandAvatar(HandAvatar):
             UsageError: a pose that is none, or a size out of range.
         """
         check_edge(size)
-        if pose is not None:
-            return still(self.render(pose, size=size), background, repr(self))
-        return turntable(
-            lambda turn: self.render(self.studio.posed(REST, turn), size=size),
-            background,
-            repr(self),
-        )
+        turns = [360.0 * frame / TURN_FRAMES for frame in range(TURN_FRAMES)]
+        poses = [self.studio.posed(REST, turn) for turn in turns] if pose is None else [pose]
+        return encode([self.render(one, size=size) for one in poses], background, repr(self))
 
     def _hands(self, hands: Mapping[str, HandPose] | Pose) -> Mapping[str, HandPose]:
         """Hands as they are, or those that stand in the studio in a pose."""
@@ -386,18 +363,13 @@ class WildGHandAvatar(HandAvatar):
         }
         parts = [made for made, _ in found.values()] + (self.model.walls(found) if closed else [])
 
-        def array(tensors: list[torch.Tensor], fields: int) -> np.ndarray:
+        def array(name: str) -> np.ndarray:
             """Of one frame of each hand; tensors that all frames share have no frames."""
-            frames = [tensor if tensor.ndim == fields else tensor[0] for tensor in tensors]
+            tensors, axes = [getattr(part, name) for part in parts], 1 + (name != "opacities")
+            frames = [tensor if tensor.ndim == axes else tensor[0] for tensor in tensors]
             return torch.cat(frames).cpu().numpy()
 
-        return PosedGaussians(
-            means=array([part.means for part in parts], 2),
-            quats=array([part.quats for part in parts], 2),
-            scales=array([part.scales for part in parts], 2),
-            opacities=array([part.opacities for part in parts], 1),
-            colors=array([part.colors for part in parts], 2),
-        )
+        return PosedGaussians(**{item.name: array(item.name) for item in fields(PosedGaussians)})
 
     @functools.cached_property
     def weight_masks(self) -> Mapping[int, np.ndarray]:
@@ -408,9 +380,7 @@ class WildGHandAvatar(HandAvatar):
     def write_diagnostics(self, folder: Path) -> None:
         """Write temporal weights and weight masks for the benchmark's tables and figures."""
         for side, weights in self.record.temporal.items():
-            write_json(
-                folder / f"{side}-temporal.json",
-                {"frames": self.record.frames, "weights": weights},
-            )
+            record = {"frames": self.record.frames, "weights": weights}
+            write_json(folder / f"{side}-temporal.json", record)
         for frame, mask in self.weight_masks.items():
             write_image(folder / "weights" / f"{frame:06d}.png", mask)

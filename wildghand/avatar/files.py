@@ -10,10 +10,10 @@ Tensors are compared with the description before memory is taken.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import os
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -53,12 +53,11 @@ def read_tensors(
     frame_count: int,
     declared: Sequence[str] | None = None,
 ) -> dict[str, torch.Tensor]:
-    """Read the tensors of an avatar.
-
-    Args:
-        declared: names of all tensors; None: the description does not say.
-    """
+    """Read the tensors of an avatar; `declared` are their names, if the description says them."""
     from safetensors import SafetensorError, safe_open
+
+    def refuse(problem: str, name: str, remedy: str | None = None) -> BadInput:
+        return BadInput(problem, where=file, field=shown(name)[:100], remedy=remedy)
 
     if not file.is_file() or file.stat().st_size > MAX_MODEL_BYTES:
         raise BadInput(f"is missing or larger than {MAX_MODEL_BYTES} bytes", where=file)
@@ -70,47 +69,27 @@ def read_tensors(
                 raise BadInput(f"holds more than {MAX_TENSORS:,} tensors", where=file)
             for name in names:
                 part = stored.get_slice(name)
-                _check_part(name, part.get_shape(), str(part.get_dtype()), expected, file)
+                kind, shape = str(part.get_dtype()), tuple(part.get_shape())
+                if kind not in _FLOATS:
+                    raise refuse(f"holds {kind}, not floating point", name)
+                if shape != expected.get(name, shape):
+                    problem = f"is {shape}, not {expected[name]} as its description says"
+                    raise refuse(problem[:200], name)
             for name in sorted((expected.keys() | set(declared or ())) - set(names)):
-                raise BadInput(
-                    "is missing", where=file, field=shown(name)[:100], remedy=_ANOTHER_COPY
-                )
+                raise refuse("is missing", name, _ANOTHER_COPY)
             for name in sorted(set(names) - set(names if declared is None else declared)):
-                raise BadInput(
-                    "is not among the tensors that its description names",
-                    where=file,
-                    field=shown(name)[:100],
-                    remedy=_ANOTHER_COPY,
-                )
+                problem = "is not among the tensors that its description names"
+                raise refuse(problem, name, _ANOTHER_COPY)
             tensors = {name: stored.get_tensor(name) for name in names}
     except (SafetensorError, RuntimeError, OSError, ValueError, AssertionError) as error:
         problem = (str(error).splitlines() or [type(error).__name__])[0][:300]
         raise BadInput(f"does not hold this avatar's tensors ({problem})", where=file) from error
     for name, tensor in tensors.items():
         if not bool(torch.isfinite(tensor).all()):
-            raise BadInput("holds NaN or infinity", where=file, field=shown(name)[:100])
+            raise refuse("holds NaN or infinity", name)
         if tensor.numel() and float(tensor.abs().max()) > LARGEST:
-            raise BadInput(
-                f"holds a number beyond {LARGEST:g}",
-                where=file,
-                field=shown(name)[:100],
-                remedy=_ANOTHER_COPY,
-            )
+            raise refuse(f"holds a number beyond {LARGEST:g}", name, _ANOTHER_COPY)
     return tensors
-
-
-def _check_part(
-    name: str, shape: Sequence[int], kind: str, expected: dict[str, tuple[int, ...]], file: Path
-) -> None:
-    field = shown(name)[:100]
-    if kind not in _FLOATS:
-        raise BadInput(f"holds {kind}, not floating point", where=file, field=field)
-    if name in expected and tuple(shape) != expected[name]:
-        raise BadInput(
-            f"is {tuple(shape)}, not {expected[name]} as its description says"[:200],
-            where=file,
-            field=field,
-        )
 
 
 def _shapes(
@@ -140,15 +119,10 @@ def write_weight_masks(avatar: WildGHandAvatar, folder: Path) -> None:
 
 
 def read_weight_masks(folder: Path, frames: list[int]) -> dict[int, np.ndarray]:
-    """Read the weight masks of frames that an avatar was fitted to.
-
-    Returns:
-        (H, W) uint8 by frame.
-    """
-    named = {frame: folder / f"{frame:06d}.png" for frame in frames}
-    found = sorted(path.name for path in folder.glob("*.png")) if folder.is_dir() else []
-    there = {int(name[:6]) for name in found[:_MOST] if re.fullmatch(r"\d{6}\.png", name)}
-    return {frame: read_gray(path) for frame, path in named.items() if frame in there}
+    """Read the weight masks of frames that an avatar was fitted to: (H, W) uint8 by frame."""
+    there = sorted(path.name for path in folder.glob("*.png"))[:_MOST]
+    names = {frame: f"{frame:06d}.png" for frame in frames}
+    return {frame: read_gray(folder / name) for frame, name in names.items() if name in there}
 
 
 #: Version of the folder.
@@ -228,12 +202,10 @@ def save_avatar(
 
 def made_by_call(path: Path, call: str) -> bool:
     """Whether a folder is the avatar that a call has made, by the digest of the call."""
-    if not (path / DESCRIPTION).is_file() or not (path / CALL).is_file():
-        return False
-    try:
-        return read_json(path / CALL, max_bytes=1000) == {"call": call}
-    except BadInput:
-        return False
+    with contextlib.suppress(BadInput):
+        made = read_json(path / CALL, max_bytes=1000) == {"call": call}
+        return made and (path / DESCRIPTION).is_file()
+    return False
 
 
 def load_avatar(
@@ -316,7 +288,7 @@ def _check_description(value: _Description) -> None:
             raise BadInput(
                 f"must be ten numbers from -{MAX_BETA:g} to {MAX_BETA:g} for each hand",
                 field=f"betas.{side}",
-                remedy="The avatar is damaged: take another copy, or fit it again.",
+                remedy=_ANOTHER_COPY,
             )
 
 
@@ -324,22 +296,18 @@ def _templates(
     hand_model: HandModelId, sides: list[str], hand: str | None, where: str
 ) -> dict[str, HandTemplate]:
     templates = {side: load_template(hand or hand_model.source, side) for side in sides}
-    name = next(iter(templates.values())).name
-    if name != hand_model.name:
-        raise BadInput(
-            f"was made with the hand model {hand_model.name}, not {name}",
-            where=where,
-            field="hand_model",
-            remedy=f"Give the model it was made with: --hand-model {hand_model.source}.",
-        )
+    found = next(iter(templates.values()))
+    problem = ""
+    if found.name != hand_model.name:
+        problem = f"was made with the hand model {hand_model.name}, not {found.name}"
+        remedy = f"Give the model it was made with: --hand-model {hand_model.source}."
     # The same surface from another file is the same model; of another edition every vertex differs.
-    digest = next(iter(templates.values())).digest
-    if digest != hand_model.digest:
-        raise BadInput(
-            f"was made with another edition of the hand model {name} "
-            f"({hand_model.digest[:12]}) than the one here ({digest[:12]})",
-            where=where,
-            field="hand_model",
-            remedy="Give the edition it was made with (--hand-model), or fit the avatar again.",
+    elif found.digest != hand_model.digest:
+        problem = (
+            f"was made with another edition of the hand model {found.name} "
+            f"({hand_model.digest[:12]}) than the one here ({found.digest[:12]})"
         )
+        remedy = "Give the edition it was made with (--hand-model), or fit the avatar again."
+    if problem:
+        raise BadInput(problem, where=where, field="hand_model", remedy=remedy)
     return templates

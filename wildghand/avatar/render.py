@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.stats import spearmanr
 
 from hwp_bench.base.console import track
 from hwp_bench.base.drawing import labelled, sheet
@@ -20,7 +21,6 @@ from hwp_bench.capture import Capture
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.gaussians.training import TrainingClip
 from wildghand.model.frames import largest
-from wildghand.model.model import WildGHandModel
 from wildghand.splat.threads import denormals_flushed
 
 
@@ -124,30 +124,57 @@ def explain_frames(
         if frame not in fitted:
             raise UsageError(f"{frame} was not fitted", field="frames")
     clip = TrainingClip(capture, np.array(fitted), model.rigs, torch.device("cpu"))
-    found = []
+    info, found = capture.info, []
     for frame in frames:
         row = fitted.index(frame)
-        biased, canonical = (
-            _drawn(model, clip, row, capture, avatar.settings.heads, biases=on)
-            for on in (True, False)
-        )
-        mask = capture.mask(frame)[..., None] / 255.0
-        found.append(
-            Explanation(
-                frame, float(omegas[row]), capture.frame(frame) / 255.0 * mask, canonical, biased
+        pictures = []
+        for biases in (False, True):
+            kept = {side: torch.tensor([biases]) for side in model.perturbation}
+            drawing = model.draw_frames(
+                clip,
+                torch.tensor([row]),
+                info.width,
+                info.height,
+                kept=kept,
+                move=True,
+                refine=avatar.settings.heads,
             )
-        )
+            image = drawing.image[0] if biases else drawing.image[0] / model.log_gains[row].exp()
+            pictures.append(image.clamp(0.0, 1.0).numpy())
+        seen = capture.frame(frame) / 255.0 * (capture.mask(frame)[..., None] / 255.0)
+        found.append(Explanation(frame, float(omegas[row]), seen, *pictures))
+    return found
+
+
+@torch.no_grad()
+def temporal_weights(
+    avatar: WildGHandAvatar, capture: Capture
+) -> dict[str, tuple[float, float | None]]:
+    """The mean size of omega by hand, and its rank correlation with the frames' severity.
+
+    Severity is the sum of the levels of all perturbations. The correlation (Spearman's) is None
+    where a level is not known, or where all frames have the same severity or weight.
+    """
+    frames, found = avatar.record.frames, {}
+    levels = [[*capture.info.severity(frame).values()] for frame in frames]
+    known = all(level is not None for each in levels for level in each)
+    severity = [sum(level or 0 for level in each) for each in levels]
+    for side in avatar.model.perturbation:
+        temporal = avatar.model.biases_of(side).temporal(torch.arange(len(frames)))
+        sizes, rank = temporal.omega.abs().numpy(), None
+        if known and len(set(severity)) > 1 and len(set(sizes.tolist())) > 1:
+            rank = float(spearmanr(sizes, severity).statistic)
+        found[side] = float(sizes.mean()), rank
     return found
 
 
 def explanation_sheet(
     found: Sequence[Explanation], names: Mapping[int, str] | None = None
 ) -> np.ndarray:
-    """A sheet with a row for each frame.
+    """A sheet (H, W, 3) uint8 with a row for each frame.
 
-    Returns:
-        (H, W, 3) uint8: frame, without biases, with biases, and the difference of the two, grey
-        where there is none.
+    It shows the frame, the hand without biases and with them, and the difference of the two, grey
+    where there is none.
     """
     tiles = []
     for item in found:
@@ -161,24 +188,3 @@ def explanation_sheet(
         ):
             tiles.append(labelled(as_uint8(np.clip(picture, 0.0, 1.0).astype(np.float32)), caption))
     return sheet(tiles, 4)
-
-
-def _drawn(
-    model: WildGHandModel,
-    clip: TrainingClip,
-    row: int,
-    capture: Capture,
-    refine: bool,
-    *,
-    biases: bool,
-) -> np.ndarray:
-    rows = torch.tensor([row])
-    kept = {side: torch.tensor([biases]) for side in model.perturbation}
-    info = capture.info
-    drawing = model.draw_frames(
-        clip, rows, info.width, info.height, kept=kept, move=True, refine=refine
-    )
-    image = drawing.image[0]
-    if not biases:
-        image = image / model.log_gains[row].exp()
-    return image.clamp(0.0, 1.0).numpy()

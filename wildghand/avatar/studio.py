@@ -49,7 +49,6 @@ class HandAngles:
         right: the right hand of the same model, in which the named poses are defined.
 
     Attributes:
-        side: `right` or `left`.
         lower: (16, 3) whole degrees, the least angles; not positive.
         upper: (16, 3) whole degrees, the largest angles; not negative.
         upright: turns the hand model's rest frame so that the fingers point up.
@@ -76,14 +75,7 @@ class HandAngles:
         return cls(load_template(source, side), load_template(source, "right"))
 
     def pose(self, angles: np.ndarray) -> np.ndarray:
-        """Turn angles into the hand model's pose.
-
-        Args:
-            angles: (16, 3) degrees, of any size.
-
-        Returns:
-            (16, 3) axis-angle, rad.
-        """
+        """Turn angles (16, 3) of any size into the hand model's pose (16, 3), rad."""
         given = torch.from_numpy(np.radians(np.asarray(angles, dtype=np.float64)))
         pose = pose_from_joint_angles(given[None], self._axes)[0].numpy()
         pose[0] = (self.upright * Rotation.from_rotvec(pose[0])).as_rotvec()
@@ -115,19 +107,12 @@ class HandAngles:
         """Return the angles of one named pose."""
         poses = self.named_poses()
         if name not in poses:
-            raise UsageError(
-                f"there is no pose {name[:40]!r}",
-                field="pose",
-                remedy=f"Known: {', '.join(poses)}.",
-            )
+            known = f"Known: {', '.join(poses)}."
+            raise UsageError(f"there is no pose {name[:40]!r}", field="pose", remedy=known)
         return poses[name]
 
     def from_names(self, given: Mapping[str, float]) -> np.ndarray:
-        """Return the angles of a hand at rest but for those that are named.
-
-        Args:
-            given: degrees by name of `ANGLE_NAMES`, as `{"index1 flexion": 60}`.
-        """
+        """Return the angles of a hand at rest but for those that are named in `ANGLE_NAMES`."""
         angles = np.zeros((len(JOINT_NAMES), 3))
         for name, degrees in given.items():
             if name not in ANGLE_NAMES:
@@ -136,11 +121,8 @@ class HandAngles:
             place = divmod(ANGLE_NAMES.index(name), len(ANGLES))
             low, high = self.lower[place], self.upper[place]
             if not low <= degrees <= high:
-                raise UsageError(
-                    f"{name} is {degrees:g} degrees",
-                    field="pose",
-                    remedy=f"Use {low:g} to {high:g}.",
-                )
+                problem, remedy = f"{name} is {degrees:g} degrees", f"Use {low:g} to {high:g}."
+                raise UsageError(problem, field="pose", remedy=remedy)
             angles[place] = degrees
         return angles
 
@@ -165,11 +147,6 @@ _ASIDE, _ROOM = 0.6, 1.12
 
 class Studio:
     """The place of an avatar's hands and of the camera before them.
-
-    Args:
-        source: of the hand model (`anny`, `mano:PATH`).
-        templates: the person's hands at rest, by side.
-        betas: (10,) by side.
 
     Attributes:
         angles: the named angles of each hand.
@@ -207,37 +184,21 @@ class Studio:
         posed = pose_hand(template, pose.to(like), betas.to(like), torch.zeros(1, 3).to(like))
         return posed.vertices[0].double().cpu().numpy(), posed.joints[0, 0].double().cpu().numpy()
 
-    def hands(self, angles: Mapping[str, np.ndarray], turn: float = 0.0) -> dict[str, HandPose]:
-        """Return hands that stand in the studio.
-
-        Args:
-            angles: (16, 3) degrees by side.
-            turn: of all of them about the vertical through their middle, degrees.
-        """
-        return {
-            side: self._standing(side, self.angles[side].pose(given), turn)
-            for side, given in angles.items()
-        }
-
     def posed(self, pose: Pose = REST, turn: float = 0.0) -> dict[str, HandPose]:
         """Return every hand in one pose, as it stands in the studio.
 
         Args:
-            turn: about the vertical, degrees.
+            turn: of all of them about the vertical through their middle, degrees.
         """
-        return {
-            side: self._standing(side, _axis_angles(pose, angles), turn)
-            for side, angles in self.angles.items()
-        }
-
-    def _standing(self, side: str, pose: np.ndarray, turn: float) -> HandPose:
-        turned = Rotation.from_euler("y", turn, degrees=True)
-        pose = pose.copy()
-        pose[0] = (turned * Rotation.from_rotvec(pose[0])).as_rotvec()
-        # Rotations leave the wrist where it is, so the translation carries it around.
-        wrist = self._wrists[side]
-        transl = turned.apply(wrist + self._transl[side]) + self.centre - wrist
-        return HandPose(side, pose, self._betas[side], transl)
+        turned, hands = Rotation.from_euler("y", turn, degrees=True), {}
+        for side, angles in self.angles.items():
+            vectors = _axis_angles(pose, angles).copy()
+            vectors[0] = (turned * Rotation.from_rotvec(vectors[0])).as_rotvec()
+            # Rotations leave the wrist where it is, so the translation carries it around.
+            wrist = self._wrists[side]
+            transl = turned.apply(wrist + self._transl[side]) + self.centre - wrist
+            hands[side] = HandPose(side, vectors, self._betas[side], transl)
+        return hands
 
     def camera(self, width: int, height: int) -> Camera:
         """Return the camera: at the origin, along z, with all of the hands in its picture."""

@@ -4,36 +4,23 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from hwp_bench.cli.options import overrides, print_json
+from wildghand.cli.options import (
+    add_address,
+    add_ending,
+    add_fitting,
+    address_of,
+    check_fitting,
+)
 
 if TYPE_CHECKING:
     from wildghand.fitting.parallel import World
     from wildghand.fitting.session import Watch
     from wildghand.from_video import MadeAvatar
-    from wildghand.viewer.server import Address
-
-
-def add_address(parser: argparse.ArgumentParser) -> None:
-    """Add --host and --port."""
-    parser.add_argument(
-        "--host",
-        default="127.0.0.1",
-        metavar="ADDRESS",
-        help="address to serve at (default: 127.0.0.1, for this machine only)",
-    )
-    parser.add_argument(
-        "--port", type=int, default=8080, help="port; the next free one if it is taken"
-    )
-
-
-def address_of(args: argparse.Namespace) -> Address:
-    """Return what `add_address` read."""
-    from wildghand.viewer.server import Address
-
-    return Address(args.host, args.port)
 
 
 @contextlib.contextmanager
@@ -70,56 +57,29 @@ GPU of its own.
 def add_fit(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.epilog = _FIT_EXAMPLES
-    parser.add_argument("source", type=Path, metavar="VIDEO|CAPTURE", help="what to fit")
-    parser.add_argument(
-        "-o", "--out", type=Path, help="avatar folder to make (default for a video: VIDEO_avatar)"
-    )
-    parser.add_argument(
-        "--quick", action="store_true", help="a third of the time: fewer frames, Gaussians, steps"
-    )
-    parser.add_argument(
-        "--side",
-        choices=("auto", "right", "left"),
-        help="the hands in a video (default: auto, one or both, as it shows)",
-    )
-    parser.add_argument(
-        "--landmarks", type=Path, metavar="NPZ", help="landmarks of a video (default: track them)"
-    )
-    parser.add_argument(
-        "--model", type=Path, metavar="FILE", help="the tracker's networks, as `data track` takes"
-    )
-    parser.add_argument(
-        "--hand-model", metavar="MODEL", help="for a video: anny (default) or mano:PATH"
-    )
-    parser.add_argument("--steps", type=int, help="optimizer steps")
-    parser.add_argument("--seconds", type=float, help="most seconds of optimizing")
-    parser.add_argument("--seed", type=int, default=0, help="of everything random (default: 0)")
-    parser.add_argument(
-        "--all-frames",
-        action=argparse.BooleanOptionalAction,
-        help="fit validation and test frames too (default: for a video yes, for a capture no)",
-    )
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help="a setting, as schedule.batch=4 (wildghand/model/settings.py); may be repeated",
-    )
-    parser.add_argument(
-        "--prior",
-        type=Path,
-        metavar="PRIOR",
-        help="start from it (made by `wildghand pretrain`; default: the one that ships)",
-    )
-    parser.add_argument(
-        "--live",
-        action="store_true",
-        help="show the fit in the browser while it runs (needs viser); changes nothing of it",
-    )
+    add = parser.add_argument
+    add("source", type=Path, metavar="VIDEO|CAPTURE", help="what to fit")
+    out = "avatar folder to make (default for a video: VIDEO_avatar)"
+    add("-o", "--out", type=Path, help=out)
+    quick = "a third of the time: fewer frames, Gaussians, steps"
+    add("--quick", action="store_true", help=quick)
+    sides = "the hands in a video (default: auto, one or both, as it shows)"
+    add("--side", choices=("auto", "right", "left"), help=sides)
+    landmarks = "landmarks of a video (default: track them)"
+    add("--landmarks", type=Path, metavar="NPZ", help=landmarks)
+    networks = "the tracker's networks, as `data track` takes"
+    add("--model", type=Path, metavar="FILE", help=networks)
+    add("--hand-model", metavar="MODEL", help="for a video: anny (default) or mano:PATH")
+    add_fitting(parser, "optimizer steps")
+    add("--seconds", type=float, help="most seconds of optimizing")
+    frames = "fit validation and test frames too (default: for a video yes, for a capture no)"
+    add("--all-frames", action=argparse.BooleanOptionalAction, help=frames)
+    prior = "start from it (made by `wildghand pretrain`; default: the one that ships)"
+    add("--prior", type=Path, metavar="PRIOR", help=prior)
+    live = "show the fit in the browser while it runs (needs viser); changes nothing of it"
+    add("--live", action="store_true", help=live)
     add_address(parser)
-    parser.add_argument("--overwrite", action="store_true", help="replace an existing avatar")
-    parser.add_argument("--json", action="store_true", help="print JSON")
+    add_ending(parser, "avatar")
 
 
 def do_fit(args: argparse.Namespace) -> int:
@@ -164,7 +124,7 @@ def _video(args: argparse.Namespace, world: World) -> int:
             args.source, args.out, options, overwrite=args.overwrite, world=world, watch=watch
         )
     if world.is_main:
-        print(json.dumps(made.facts(), indent=1)) if args.json else _print(made)
+        print_json(made.facts()) if args.json else _print(made)
     return 0
 
 
@@ -174,9 +134,8 @@ def _print(made: MadeAvatar) -> None:
     print(f"{facts['avatar']}: {hands} hand, {facts['frames']} frames, {facts['steps']} steps")
     if "warning" in facts["video"]:
         print(f"video: {facts['video']['warning']}")
-    print(f"turntable: {facts['turntable']}")
-    print(f"sheet: {facts['sheet']}")
-    print(f"page: {facts['page']}")
+    for name in ("turntable", "sheet", "page"):
+        print(f"{name}: {facts[name]}")
     took = ", ".join(f"{one['name']} {one['seconds']:.0f}" for one in facts["stages"])
     print(f"seconds: {took}")
 
@@ -185,7 +144,7 @@ def _capture(args: argparse.Namespace, world: World) -> int:
     from hwp_bench.base.errors import UsageError
     from hwp_bench.methods.contract import Budget
     from wildghand.fitting.session import fit_capture
-    from wildghand.from_video.job import with_quick
+    from wildghand.from_video.run import with_quick
 
     for option in ("side", "landmarks", "model", "hand-model"):
         if getattr(args, option.replace("-", "_")) is not None:
@@ -194,12 +153,9 @@ def _capture(args: argparse.Namespace, world: World) -> int:
             )
     if args.out is None:
         raise UsageError("is missing", field="--out", remedy="Name the avatar folder to make.")
-    if args.steps is not None and args.steps < 1:
-        raise UsageError(f"is {args.steps}", field="--steps", remedy="Use 1 or more.")
     if args.seconds is not None and not args.seconds > 0.0:
         raise UsageError(f"is {args.seconds}", field="--seconds", remedy="Use more than 0.")
-    if args.seed < 0:
-        raise UsageError(f"is {args.seed}", field="--seed", remedy="Use 0 or more.")
+    check_fitting(args)
     with watching(args, shown=args.live and world.is_main) as watch:
         avatar = fit_capture(
             args.source,
@@ -217,7 +173,7 @@ def _capture(args: argparse.Namespace, world: World) -> int:
     record = avatar.record
     if args.json:
         facts = {"avatar": str(args.out), "steps": record.steps, "seconds": record.seconds}
-        print(json.dumps({**facts, "hands": list(avatar.sides), "frames": len(record.frames)}))
+        print_json({**facts, "hands": list(avatar.sides), "frames": len(record.frames)})
     else:
         hands = " and ".join(avatar.sides)
         print(
@@ -229,8 +185,6 @@ def _capture(args: argparse.Namespace, world: World) -> int:
 
 def _settings(args: argparse.Namespace) -> dict[str, Any]:
     """The overrides; a prior's path is the caller's, not the method's."""
-    from hwp_bench.cli.options import overrides
-
     settings = overrides(args.set)
     if args.prior is not None:
         settings["prior"] = str(args.prior.resolve())
@@ -250,40 +204,22 @@ stopped run goes on when the same command is given again.
 def add_pretrain(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.epilog = _PRETRAIN_EXAMPLES
-    parser.add_argument(
-        "captures", type=Path, nargs="+", metavar="CAPTURE", help="what to fit jointly"
-    )
-    parser.add_argument("-o", "--out", type=Path, required=True, help="prior to make, a folder")
-    parser.add_argument(
-        "--steps",
-        type=int,
-        help="optimizer steps over all captures (default: those of a fit for each capture)",
-    )
-    parser.add_argument("--seed", type=int, default=0, help="of everything random (default: 0)")
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help="a setting of the fit (wildghand/model/settings.py); may be given again",
-    )
-    parser.add_argument("--overwrite", action="store_true", help="replace an existing prior")
-    parser.add_argument("--json", action="store_true", help="print JSON")
+    add = parser.add_argument
+    add("captures", type=Path, nargs="+", metavar="CAPTURE", help="what to fit jointly")
+    add("-o", "--out", type=Path, required=True, help="prior to make, a folder")
+    steps = "optimizer steps over all captures (default: those of a fit for each capture)"
+    add_fitting(parser, steps)
+    add_ending(parser, "prior")
 
 
 def do_pretrain(args: argparse.Namespace) -> int:
     """Run the command."""
-    from hwp_bench.base.errors import UsageError
     from hwp_bench.base.files import check_places
-    from hwp_bench.cli.options import overrides
     from wildghand.pretrain.pretrain import pretrain
     from wildghand.prior.prior import WEIGHTS
 
     check_places({"--out": args.out}, {"CAPTURE": args.captures}, replaces=args.overwrite)
-    if args.steps is not None and args.steps < 1:
-        raise UsageError(f"is {args.steps}", field="--steps", remedy="Use 1 or more.")
-    if args.seed < 0:
-        raise UsageError(f"is {args.seed}", field="--seed", remedy="Use 0 or more.")
+    check_fitting(args)
     record = pretrain(
         args.captures,
         args.out,
@@ -295,7 +231,7 @@ def do_pretrain(args: argparse.Namespace) -> int:
     size = (args.out / WEIGHTS).stat().st_size
     if args.json:
         facts = {"prior": str(args.out), "captures": len(record.captures), "steps": record.steps}
-        print(json.dumps({**facts, "bytes": size, "weights": record.weights}))
+        print_json({**facts, "bytes": size, "weights": record.weights})
     else:
         print(
             f"{args.out}: {len(record.captures)} captures, {record.steps} steps, "

@@ -3,10 +3,22 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
-from wildghand.cli.fit import add_address, address_of
+from hwp_bench.base.errors import UsageError
+from hwp_bench.base.files import check_places
+from hwp_bench.cli.options import add_json, print_json
+from wildghand.cli.options import (
+    add_address,
+    add_avatar,
+    add_ending,
+    add_poses,
+    address_of,
+    avatar_of,
+)
 
 _RENDER_EXAMPLES = """examples:
   wildghand render my_avatar --poses my_capture -o frames
@@ -21,57 +33,37 @@ The poses are those of a capture: its hand parameters and cameras. PNG files are
 def add_render(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.epilog = _RENDER_EXAMPLES
-    parser.add_argument("avatar", type=Path, help="avatar folder")
-    parser.add_argument(
-        "--poses", type=Path, required=True, metavar="CAPTURE", help="capture to take poses from"
-    )
-    parser.add_argument("-o", "--out", type=Path, required=True, help="folder of images to make")
-    parser.add_argument("--frames", metavar="A:B", help="frames A to B-1 only")
-    parser.add_argument(
-        "--background", type=int, default=0, metavar="GREY", help="0 black to 255 white"
-    )
-    parser.add_argument("--video", type=Path, metavar="MP4", help="also write a video")
-    parser.add_argument(
-        "--hand-model", metavar="MODEL", help="anny or mano:PATH (default: the avatar's own)"
-    )
-    parser.add_argument("--overwrite", action="store_true", help="replace an existing folder")
-    parser.add_argument("--json", action="store_true", help="print JSON")
+    add = parser.add_argument
+    add_avatar(parser)
+    add_poses(parser, "capture to take poses from", required=True)
+    add("-o", "--out", type=Path, required=True, help="folder of images to make")
+    add("--frames", metavar="A:B", help="frames A to B-1 only")
+    add("--background", type=int, default=0, metavar="GREY", help="0 black to 255 white")
+    add("--video", type=Path, metavar="MP4", help="also write a video")
+    add_ending(parser, "folder")
 
 
 def do_render(args: argparse.Namespace) -> int:
     """Run the command."""
-    from hwp_bench.base.errors import UsageError
-    from hwp_bench.base.files import check_places
     from hwp_bench.capture import open_capture
-    from wildghand.avatar.files import load_avatar
     from wildghand.avatar.render import render_clip
 
     if not 0 <= args.background <= 255:
         raise UsageError(f"is {args.background}", field="--background", remedy="Use 0 to 255.")
     inputs = {"AVATAR": args.avatar, "--poses": args.poses}
     check_places({"--out": args.out, "--video": args.video}, inputs, replaces=args.overwrite)
-    avatar = load_avatar(args.avatar, hand=args.hand_model)
-    capture = open_capture(args.poses)
+    avatar, capture = avatar_of(args), open_capture(args.poses)
     frames = _frames(args.frames, capture.info.frame_count)
-    facts = render_clip(
-        avatar,
-        capture,
-        frames,
-        args.out,
-        background=args.background,
-        video=args.video,
-        overwrite=args.overwrite,
-    )
+    choices = {name: getattr(args, name) for name in ("background", "video", "overwrite")}
+    facts = render_clip(avatar, capture, frames, args.out, **choices)
     if args.json:
-        print(json.dumps(facts))
+        print_json(facts)
     else:
         print(f"{args.out}: {facts['frames']} frames, {facts['frames_per_second']:.1f} a second")
     return 0
 
 
 def _frames(text: str | None, count: int) -> range:
-    from hwp_bench.base.errors import UsageError
-
     if text is None:
         return range(count)
     first, colon, last = text.partition(":")
@@ -80,11 +72,8 @@ def _frames(text: str | None, count: int) -> range:
     except ValueError:
         start = stop = -1
     if not 0 <= start < stop <= count:
-        raise UsageError(
-            f"{text!r} is not a part of {count} frames",
-            field="--frames",
-            remedy="Use A:B, as 0:10.",
-        )
+        problem = f"{text!r} is not a part of {count} frames"
+        raise UsageError(problem, field="--frames", remedy="Use A:B, as 0:10.")
     return range(start, stop)
 
 
@@ -103,30 +92,19 @@ viser: pip install 'hwp-bench[view]'.
 def add_view(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.epilog = _VIEW_EXAMPLES
-    parser.add_argument("avatar", type=Path, help="avatar folder")
-    parser.add_argument(
-        "--poses",
-        type=Path,
-        metavar="CAPTURE",
-        help="capture whose motion is played (default: the one that the avatar was made of, where "
+    add = parser.add_argument
+    add_avatar(parser)
+    add_poses(
+        parser,
+        "capture whose motion is played (default: the one that the avatar was made of, where "
         "it lies with the avatar)",
     )
     add_address(parser)
-    parser.add_argument(
-        "--size", type=int, default=1024, metavar="PX", help="largest edge of a picture"
-    )
-    parser.add_argument(
-        "--background",
-        type=int,
-        nargs=3,
-        default=(255, 255, 255),
-        metavar=("R", "G", "B"),
-        help="colour behind the hand, 0 to 255 each (default: white)",
-    )
-    parser.add_argument(
-        "--hand-model", metavar="MODEL", help="anny or mano:PATH (default: the avatar's own)"
-    )
-    parser.add_argument("--json", action="store_true", help="print JSON")
+    add("--size", type=int, default=1024, metavar="PX", help="largest edge of a picture")
+    text = "colour behind the hand, 0 to 255 each (default: white)"
+    white, names = (255, 255, 255), ("R", "G", "B")
+    add("--background", type=int, nargs=3, default=white, metavar=names, help=text)
+    add_json(parser)
 
 
 def do_view(args: argparse.Namespace) -> int:
@@ -134,7 +112,6 @@ def do_view(args: argparse.Namespace) -> int:
     import threading
 
     from hwp_bench.capture import open_capture
-    from wildghand.avatar.files import load_avatar
     from wildghand.viewer.posed_view import Motion, capture_of
     from wildghand.viewer.server import require_viser
     from wildghand.viewer.view import ViewSettings, serve_view
@@ -142,8 +119,7 @@ def do_view(args: argparse.Namespace) -> int:
     red, green, blue = args.background
     settings = ViewSettings(args.size, (red, green, blue))
     require_viser()
-    avatar = load_avatar(args.avatar, hand=args.hand_model)
-    poses = args.poses or capture_of(args.avatar)
+    avatar, poses = avatar_of(args), args.poses or capture_of(args.avatar)
     motion = None if poses is None else Motion(avatar, open_capture(poses))
     try:
         with serve_view(avatar, motion, address_of(args), settings) as served:
@@ -172,77 +148,45 @@ a skinned mesh with 16 joints a hand, a texture and a motion. Lengths are metres
 def add_export(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.epilog = _EXPORT_EXAMPLES
-    parser.add_argument("avatar", type=Path, help="avatar folder")
-    parser.add_argument(
-        *("-o", "--out"), type=Path, required=True, metavar="FILE", help="file to write"
+    add = parser.add_argument
+    add_avatar(parser)
+    add("-o", "--out", type=Path, required=True, metavar="FILE", help="file to write")
+    mesh = "a skinned mesh instead of Gaussians (.glb)"
+    add("--mesh", action="store_true", help=mesh)
+    add_poses(parser, "capture to take a pose or a motion from")
+    add("--frame", type=int, help="its frame, for Gaussians (default: 0)")
+    scale = "units of the file in a metre (default: 1)"
+    add("--scale", type=float, default=1.0, help=scale)
+    turned = "for SuperSplat: opens upright, palm to the viewer, ten units in a metre (.ply)"
+    add("--supersplat", action="store_true", help=turned)
+    degree = (
+        "how finely colours of Gaussians change with the side they are seen from, 0 to 3 "
+        "(default: 3; 0: one colour each, and a third of the size)"
     )
-    parser.add_argument(
-        "--mesh", action="store_true", help="a skinned mesh instead of Gaussians (.glb)"
-    )
-    parser.add_argument(
-        "--poses", type=Path, metavar="CAPTURE", help="capture to take a pose or a motion from"
-    )
-    parser.add_argument("--frame", type=int, help="its frame, for Gaussians (default: 0)")
-    parser.add_argument(
-        "--scale", type=float, default=1.0, help="units of the file in a metre (default: 1)"
-    )
-    parser.add_argument(
-        "--supersplat",
-        action="store_true",
-        help="for SuperSplat: opens upright, palm to the viewer, ten units in a metre (.ply)",
-    )
-    parser.add_argument(
-        "--harmonics",
-        type=int,
-        default=3,
-        metavar="DEGREE",
-        help="how finely colours of Gaussians change with the side they are seen from, 0 to 3 "
-        "(default: 3; 0: one colour each, and a third of the size)",
-    )
-    parser.add_argument(
-        "--texture",
-        type=int,
-        default=1024,
-        metavar="TEXELS",
-        help="edge of a mesh's texture (default: 1024)",
-    )
-    parser.add_argument(
-        "--hand-model", metavar="MODEL", help="anny or mano:PATH (default: the avatar's own)"
-    )
-    parser.add_argument("--overwrite", action="store_true", help="replace what exists")
-    parser.add_argument("--json", action="store_true", help="print counts as JSON")
+    add("--harmonics", type=int, default=3, metavar="DEGREE", help=degree)
+    texels = "edge of a mesh's texture (default: 1024)"
+    add("--texture", type=int, default=1024, metavar="TEXELS", help=texels)
+    add_ending(parser, "file")
 
 
 def do_export(args: argparse.Namespace) -> int:
     """Run the command."""
-    from hwp_bench.base.errors import UsageError
-    from hwp_bench.base.files import check_places
     from wildghand.export.formats import ExportSettings, check_target, export
 
-    settings = ExportSettings(
-        mesh=args.mesh,
-        scale=args.scale,
-        supersplat=args.supersplat,
-        harmonics=args.harmonics,
-        texture=args.texture,
-    )
+    names = (item.name for item in dataclasses.fields(ExportSettings))
+    settings = ExportSettings(**{name: getattr(args, name) for name in names})
     check_places({"--out": args.out}, {"AVATAR": args.avatar, "--poses": args.poses})
     check_target(args.out, settings, overwrite=args.overwrite)
     if args.frame is not None and (args.poses is None or args.mesh):
         raise UsageError("needs --poses, and no --mesh", field="--frame")
 
-    import json
-
     from hwp_bench.capture import open_capture
-    from wildghand.avatar.files import load_avatar
 
     capture = None if args.poses is None else open_capture(args.poses)
-    avatar = load_avatar(args.avatar, hand=args.hand_model)
-    counts = export(
-        avatar, args.out, settings, capture=capture, frame=args.frame, overwrite=args.overwrite
-    )
+    more: dict[str, Any] = {"capture": capture, "frame": args.frame, "overwrite": args.overwrite}
+    counts = export(avatar_of(args), args.out, settings, **more)
     if args.json:
-        print(json.dumps({"file": str(args.out), **counts}))
+        print_json({"file": str(args.out), **counts})
     else:
         print(f"{args.out}: " + ", ".join(f"{count} {name}" for name, count in counts.items()))
     return 0
@@ -261,34 +205,17 @@ the avatar's own drawing.
 def add_page(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.epilog = _PAGE_EXAMPLES
-    parser.add_argument("avatar", type=Path, help="avatar folder")
-    parser.add_argument(
-        "-o",
-        "--out",
-        type=Path,
-        default=Path("avatar.html"),
-        metavar="FILE",
-        help="file to write (default: avatar.html)",
+    add_avatar(parser)
+    out, text = Path("avatar.html"), "file to write (default: avatar.html)"
+    parser.add_argument("-o", "--out", type=Path, default=out, metavar="FILE", help=text)
+    add_poses(
+        parser, "capture that was fitted, for its motion (default: what a fit of a video left)"
     )
-    parser.add_argument(
-        "--poses",
-        type=Path,
-        metavar="CAPTURE",
-        help="capture that was fitted, for its motion (default: what a fit of a video left)",
-    )
-    parser.add_argument(
-        "--hand-model", metavar="MODEL", help="anny or mano:PATH (default: the avatar's own)"
-    )
-    parser.add_argument("--overwrite", action="store_true", help="replace an existing file")
-    parser.add_argument("--json", action="store_true", help="print JSON")
+    add_ending(parser, "file")
 
 
 def do_page(args: argparse.Namespace) -> int:
     """Run the command."""
-    import dataclasses
-    import json
-
-    from hwp_bench.base.files import check_places
     from hwp_bench.capture import open_capture
     from wildghand.page import write_page
     from wildghand.viewer.posed_view import capture_of
@@ -300,7 +227,7 @@ def do_page(args: argparse.Namespace) -> int:
         args.avatar, args.out, capture=capture, hand=args.hand_model, overwrite=args.overwrite
     )
     if args.json:
-        print(json.dumps(dataclasses.asdict(facts)))
+        print_json(dataclasses.asdict(facts))
         return 0
     print(f"{args.out}: {facts.gaussians} Gaussians, {facts.bytes / 1e6:.2f} MB")
     if facts.fidelity is not None:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hwp_bench.base.files import check_places
+from hwp_bench.cli.options import add_json, print_json
 from hwp_bench.cli.program import add_shell_argument
+from wildghand.cli.options import add_avatar, avatar_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -32,59 +33,46 @@ not changed.
 def add_judge(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.epilog = _JUDGE_EXAMPLES
-    parser.add_argument("capture", type=Path, help="capture folder")
-    parser.add_argument("-o", "--out", type=Path, metavar="FILE", help="JSON file to write")
-    parser.add_argument(
-        "--picture", type=Path, metavar="FILE", help="PNG file to write: the estimates over time"
-    )
-    parser.add_argument("--json", action="store_true", help="print JSON")
+    add = parser.add_argument
+    add("capture", type=Path, help="capture folder")
+    add("-o", "--out", type=Path, metavar="FILE", help="JSON file to write")
+    add("--picture", type=Path, metavar="FILE", help="PNG file to write: the estimates over time")
+    add_json(parser)
 
 
 def do_judge(args: argparse.Namespace) -> int:
     """Run the command."""
-    from hwp_bench.base.files import check_places, write_json
+    import numpy as np
+
+    from hwp_bench.base.console import track
+    from hwp_bench.base.files import write_json
     from hwp_bench.capture import open_capture
+    from wildghand.prepass import capture_input, estimated_severity, judge_frames
 
     outputs = {"--out": args.out, "--picture": args.picture}
     check_places(outputs, {"CAPTURE": args.capture})
     capture = open_capture(args.capture)
-    assessment, levels = _judge(capture)
-    record = _record(capture, assessment, levels)
-    if args.out is not None:
-        write_json(args.out, record)
-    if args.picture is not None:
-        _draw_judged(assessment, levels, args.picture)
-    if args.json:
-        json.dump(record, sys.stdout, indent=1)
-        print()
-    else:
-        _print_judged(capture, assessment, levels)
-    return 0
-
-
-def _judge(capture: Capture) -> tuple[FrameAssessment, dict[str, np.ndarray]]:
-    import numpy as np
-
-    from hwp_bench.base.console import track
-    from wildghand.prepass import capture_input, estimated_severity, judge_frames
-
     every = np.arange(len(capture))
     assessment = judge_frames(capture_input(capture, every, track(every.tolist(), "Reading")))
     levels = estimated_severity(assessment)
-    listed = capture.info.perturbations
-    return assessment, {kind: level for kind, level in levels.items() if kind in (listed or levels)}
-
-
-def _record(
-    capture: Capture, assessment: FrameAssessment, levels: dict[str, np.ndarray]
-) -> dict[str, Any]:
-    return {
+    listed = capture.info.perturbations or levels
+    levels = {kind: level for kind, level in levels.items() if kind in listed}
+    record = {
         "capture": capture.info.id,
         "estimated": True,
         "clean": [round(value, 4) for value in assessment.clean.tolist()],
         "usable": assessment.usable.tolist(),
         "severity": {kind: level.tolist() for kind, level in levels.items()},
     }
+    if args.out is not None:
+        write_json(args.out, record)
+    if args.picture is not None:
+        _draw_judged(assessment, levels, args.picture)
+    if args.json:
+        print_json(record)
+    else:
+        _print_judged(capture, assessment, levels)
+    return 0
 
 
 def _print_judged(
@@ -139,36 +127,27 @@ eight frames of largest temporal weight are shown. The capture is the one that w
 def add_explain(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.epilog = _EXPLAIN_EXAMPLES
-    parser.add_argument("avatar", type=Path, help="avatar folder")
-    parser.add_argument("capture", type=Path, help="capture folder that it was fitted to")
-    parser.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="PNG file")
-    parser.add_argument(
-        "--frames", type=int, nargs="+", action="extend", metavar="N", help="frames of the capture"
-    )
-    parser.add_argument(
-        "--hand-model", metavar="MODEL", help="anny or mano:PATH (default: the avatar's own)"
-    )
+    add = parser.add_argument
+    add_avatar(parser)
+    add("capture", type=Path, help="capture folder that it was fitted to")
+    add("-o", "--out", type=Path, required=True, metavar="FILE", help="PNG file")
+    text = "frames of the capture"
+    add("--frames", type=int, nargs="+", action="extend", metavar="N", help=text)
 
 
 def do_explain(args: argparse.Namespace) -> int:
     """Run the command."""
-    from hwp_bench.base.files import check_places
     from hwp_bench.base.images import write_image
     from hwp_bench.capture import open_capture
-    from wildghand.avatar.files import load_avatar
     from wildghand.avatar.render import explain_frames, explanation_sheet
 
     check_places({"--out": args.out}, {"AVATAR": args.avatar, "CAPTURE": args.capture})
     capture = open_capture(args.capture)
-    found = explain_frames(load_avatar(args.avatar, hand=args.hand_model), capture, args.frames)
-    names = {
-        item.frame: ", ".join(
-            kind.replace("_", " ")
-            for kind, level in capture.info.severity(item.frame).items()
-            if level
-        )
-        for item in found
-    }
+    found = explain_frames(avatar_of(args), capture, args.frames)
+    names = {}
+    for item in found:
+        acting = [kind for kind, level in capture.info.severity(item.frame).items() if level]
+        names[item.frame] = ", ".join(kind.replace("_", " ") for kind in acting)
     write_image(args.out, explanation_sheet(found, names))
     print(f"{args.out}: {len(found)} frames")
     return 0
@@ -191,10 +170,9 @@ TOLERANCE = 1e-4
 def add_info(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.epilog = _INFO_EXAMPLES
-    parser.add_argument(
-        "--network", choices=("compact", "paper"), help="list the parameters of the network"
-    )
-    parser.add_argument("--json", action="store_true", help="print JSON")
+    sizes, text = ("compact", "paper"), "list the parameters of the network"
+    parser.add_argument("--network", choices=sizes, help=text)
+    add_json(parser)
 
 
 def do_info(args: argparse.Namespace) -> int:
@@ -208,8 +186,7 @@ def do_info(args: argparse.Namespace) -> int:
     facts = environment()
     backends = [_check(name) for name in ("numba", "gsplat")]
     if args.json:
-        json.dump({"environment": facts, "backends": backends}, sys.stdout, indent=1)
-        print()
+        print_json({"environment": facts, "backends": backends})
     else:
         rows = [(name, version) for name, version in facts.pop("packages").items()]
         rows = [*((name, str(value)) for name, value in facts.items()), *rows]
@@ -238,16 +215,9 @@ def _print_network(size: str, as_json: bool) -> None:
             for row in rows
         ]
         facts = {"settings": settings.to_json(), "layers": layers, "parts": parts, "total": total}
-        json.dump(facts, sys.stdout, indent=1)
-        print()
+        print_json(facts)
         return
-    columns = (
-        Column("layer"),
-        Column("weights"),
-        Column("each"),
-        Column("times"),
-        Column("parameters"),
-    )
+    columns = tuple(map(Column, ("layer", "weights", "each", "times", "parameters")))
     cells = [
         (row.layer, row.weights, f"{row.each:,}", row.times, f"{row.parameters:,}") for row in rows
     ]

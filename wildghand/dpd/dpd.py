@@ -10,7 +10,6 @@ import torch
 from torch import Tensor, nn
 
 from hwp_bench.base.errors import BadInput, ShapeMismatch, UsageError
-from hwp_bench.methods.settings import number
 from wildghand.gaussians.attributes import CHANNELS, SIZES, RawAttributes
 from wildghand.gaussians.rig import HandRig
 from wildghand.gaussians.shading import sh_basis, sh_count
@@ -95,24 +94,20 @@ ENCODED = 2 * (OCTAVES + 1) + 1
 
 @dataclass(frozen=True)
 class DpdSettings:
-    """Dynamic perturbation disentanglement, and what the pre-pass adds to it."""
+    """Dynamic perturbation disentanglement, and what is added to it."""
 
     #: Component: explain perturbations as biases of the attributes.
     enabled: bool = True
-    #: Addition: rank of the field of biases over place and normal (`wildghand.dpd.dpd`); 0: all
-    #: Gaussians of a frame share their shift, as in the paper.
-    rank: int = number(6, 0, 64)
-    #: Add the biases. Off: the temporal weights remain, which PAO reads.
-    biases: bool = True
-    #: Addition: residual, in those of clean frames, at which the canonical hand learns a third of a
-    #: frame that its biases explain (`wildghand.dpd.temporal`); 0: explaining pays nothing back.
-    pay_back: float = number(0.0, 0.0, 1000.0)
-    #: Addition: a gain of each frame's colours, held near that of clean frames.
-    gains: bool = True
-    #: Addition: temporal weight that a frame of the least weight in the pre-pass starts at and is
-    #: held near. 0: all start at 0, and only those of clean frames are held there.
-    omega_scale: float = number(0.5, 0.0, 0.9)
+    #: Addition: a field of biases over place and normal, a gain of each frame's colours, and
+    #: temporal weights that start where the pre-pass's weights of the frames put them.
+    additions: bool = True
+    #: The authors' pose head by time: small corrections of each frame's pose from its embedding.
+    poses: bool = False
 
+    #: Rank of the field.
+    rank: ClassVar[int] = 6
+    #: Temporal weight that a frame of the least weight in the pre-pass starts at and is held near.
+    omega_scale: ClassVar[float] = 0.5
     #: Weight of the square of the log gains, for a frame that is surely clean; 2 wins nothing.
     gain_weight: ClassVar[float] = 0.1
     #: Weight of the square of what separates the log gains of a frame's channels: exposure wanders
@@ -148,6 +143,8 @@ class DynamicPerturbation(nn.Module):
         frame_count: L, the frames that have a temporal embedding, at least 1.
         width: of the embedding; 256 makes the paper's 75,323 parameters.
         rank: of the field that is added to varphi; 0: no field, as in the paper.
+        poses: the largest correction of each number of a pose (rad) and of a translation (m) by
+            the authors' pose head by time; None: no such head.
 
     Attributes:
         field: the field; None without.
@@ -161,7 +158,13 @@ class DynamicPerturbation(nn.Module):
 
     encoding: Tensor
 
-    def __init__(self, frame_count: int, width: int = 256, rank: int = 0) -> None:
+    def __init__(
+        self,
+        frame_count: int,
+        width: int = 256,
+        rank: int = 0,
+        poses: tuple[float, float] | None = None,
+    ) -> None:
         super().__init__()
         if frame_count < 1:
             raise UsageError(f"is {frame_count}", field="frame_count", remedy="Use 1 or more.")
@@ -173,6 +176,14 @@ class DynamicPerturbation(nn.Module):
         nn.init.zeros_(self.psi.bias)
         self.varphi = nn.ModuleDict({name: nn.Linear(width + k, k) for name, k in SIZES.items()})
         self.field = BiasField(rank, width) if rank else None
+        self.pose_head: nn.Sequential | None = None
+        if poses is not None:
+            bounds = torch.tensor(poses).repeat_interleave(torch.tensor([48, 3]))
+            self.register_buffer("bounds", bounds, persistent=False)
+            last = nn.Linear(width, 51)
+            nn.init.zeros_(last.weight)
+            nn.init.zeros_(last.bias)
+            self.pose_head = nn.Sequential(nn.Linear(51 + width, width), nn.SiLU(), last)
         # It follows from the number of frames, so checkpoints do not hold it.
         table = encode_frames(torch.arange(frame_count), frame_count)
         self.register_buffer("encoding", table, persistent=False)
@@ -198,6 +209,20 @@ class DynamicPerturbation(nn.Module):
             )
         z = self.phi(self.encoding[frames])
         return Temporal(z, 2.0 * torch.sigmoid(self.psi(z).squeeze(-1)) - 1.0)
+
+    def move(self, pose: Tensor, transl: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Poses (B, 16, 3) and translations (B, 3) as the pose head by time corrects them."""
+        if self.pose_head is None:
+            return pose, transl
+        seen = torch.cat((pose.flatten(1), transl, z), dim=-1)
+        step = self.get_buffer("bounds") * torch.tanh(self.pose_head(seen))
+        return pose + step[:, :48].unflatten(1, (16, 3)), transl + step[:, 48:]
+
+    def sum_of_means(self, raw: Tensor, z: Tensor) -> Tensor:
+        """(B,) the sum over attributes of the mean of varphi([z, g]), for (B, N, 14) g."""
+        of_g, shift = self.layer(z)
+        means = raw.mean(dim=1) @ of_g.mT + shift
+        return torch.stack([m.mean(dim=-1) for m in means.split([*SIZES.values()], dim=-1)]).sum(0)
 
     def biases(
         self, raw: RawAttributes, z: Tensor, omega: Tensor, field: Tensor | None = None

@@ -1,7 +1,7 @@
 """Temporal weights and what a frame teaches.
 
-Where omega starts and what holds it there (`TemporalTarget`), how much of a frame its biases
-explain (`PayBack`), and how much of its gradient the canonical hand takes (`scale_gradients`).
+Where omega starts and what holds it there (`TemporalTarget`), and how much of a frame's gradient
+the canonical hand takes (`scale_gradients`).
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from torch import Tensor, nn
 from wildghand.dpd.dpd import DynamicPerturbation
 from wildghand.gaussians.adam import ClippedAdam
 from wildghand.gaussians.attributes import RawAttributes
-from wildghand.gaussians.training import upload
 from wildghand.network import NetworkOutput
 from wildghand.network.network import Refinement
 
@@ -40,27 +39,20 @@ class TemporalTarget:
 
     #: (R,) in [0, 1) where each frame's omega should be.
     omega: Tensor
-    #: (R,) in [0, 1] how much each frame is held there.
-    hold: Tensor
 
     @classmethod
-    def judged(
-        cls, clean: Tensor, frame_weights: Tensor, scale: float, floor: float
-    ) -> TemporalTarget:
+    def judged(cls, frame_weights: Tensor, scale: float, floor: float) -> TemporalTarget:
         """The targets by the pre-pass.
 
         1 / (1 + beta omega) is the weight of a frame in PAO. With beta = (1 / floor - 1) / scale it
         is here what the pre-pass found.
 
         Args:
-            clean: (R,) probability that nothing perturbs a frame.
             frame_weights: (R,) the pre-pass's, from the floor to 1.
+            scale: omega at the floor.
         """
-        if scale <= 0.0:
-            return cls(torch.zeros_like(clean), clean)
         span = max(1.0 / max(floor, _LEAST_WEIGHT) - 1.0, 1e-6)
-        target = scale * (1.0 / frame_weights.clamp(min=_LEAST_WEIGHT) - 1.0) / span
-        return cls(target, torch.ones_like(clean))
+        return cls(scale * (1.0 / frame_weights.clamp(min=_LEAST_WEIGHT) - 1.0) / span)
 
     def begin(self, modules: Sequence[DynamicPerturbation]) -> None:
         """Bring temporal weights to their targets, and biases to zero.
@@ -87,14 +79,14 @@ class TemporalTarget:
             module.zero_grad(set_to_none=True)
 
     def temporal_loss(self, modules: Sequence[DynamicPerturbation], first: int) -> Tensor:
-        """Mean over frames of the held square of the distance to the target; a sum over hands."""
+        """Mean over frames of the squared distance to the target; a sum over hands."""
         stride = math.ceil(len(self.omega) / _LOOKED_AT)
         part = slice(first % stride, None, stride)
         return torch.stack([self._distance(module, part) for module in modules]).sum()
 
     def _distance(self, module: DynamicPerturbation, part: slice) -> Tensor:
         first, last = module.phi[0], module.phi[2]
-        return _HeldDistance.apply(
+        return _Distance.apply(
             first.weight,
             first.bias,
             last.weight,
@@ -103,12 +95,11 @@ class TemporalTarget:
             module.psi.bias,
             module.encoding[: len(self.omega)][part],
             self.omega[part],
-            self.hold[part],
         )
 
 
-class _HeldDistance(torch.autograd.Function):
-    """Mean of hold (omega - target)^2, with its gradient made along with it.
+class _Distance(torch.autograd.Function):
+    """Mean of (omega - target)^2, with its gradient made along with it.
 
     Between phi's SiLU and omega's sigmoid lie two linear layers, which are one here: a code of
     each frame is not needed, and a step of the fit pays for a row instead of a matrix.
@@ -116,16 +107,15 @@ class _HeldDistance(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, *given: Tensor) -> Tensor:
-        weight1, bias1, weight2, bias2, psi, psi_bias, codes, target, hold = given
+        weight1, bias1, weight2, bias2, psi, psi_bias, codes, target = given
         before = torch.addmm(bias1, codes, weight1.T)
         gate = before.sigmoid()
         hidden = before * gate
         row = psi @ weight2
         omega = ((hidden @ row.T).squeeze(-1) + (psi @ bias2 + psi_bias)).mul_(0.5).tanh_()
         distance = omega - target
-        held = hold * distance
         # d omega / d (its argument) = (1 - omega^2) / 2.
-        slope = held * (1.0 - omega.square()) / len(target)
+        slope = distance * (1.0 - omega.square()) / len(target)
         to_row = slope[None] @ hidden
         to_shift = slope.sum()[None]
         to_before = torch.outer(slope, row[0]) * (gate * (1.0 + before * (1.0 - gate)))
@@ -137,67 +127,12 @@ class _HeldDistance(torch.autograd.Function):
             torch.addmm(to_shift * bias2, to_row, weight2.T),
             to_shift,
         )
-        return (held * distance).mean()
+        return (distance * distance).mean()
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        return (*(made * gradient for made in ctx.saved_tensors), None, None, None)
-
-
-#: Share of the newest residual of a frame in its running one.
-_FORGET = 0.5
-#: Probability from which a frame says what an ordinary residual is.
-_CLEAN_FROM = 0.5
-
-
-class PayBack:
-    """How well each frame is explained, biases included, next to the clean frames.
-
-    The share of frame l is exp(-(r_l / (tolerance r_clean))^2): r_l is the running mean error of
-    its hand as drawn with its biases, r_clean the median of the clean frames'.
-
-    Args:
-        clean: (R,) probability that a frame is clean, where the fit runs.
-        tolerance: above 0.
-
-    Attributes:
-        residuals: (R,) r; 0 for a frame that has not been drawn.
-    """
-
-    def __init__(self, clean: Tensor, tolerance: float) -> None:
-        self.residuals = torch.zeros_like(clean)
-        self._clean = clean > _CLEAN_FROM
-        self._tolerance = tolerance
-
-    @torch.no_grad()
-    def watch(self, rows: Tensor, error: Tensor, weights: Tensor) -> None:
-        """Take in how well B frames are drawn.
-
-        Args:
-            rows: (B,) int64, which of the R frames; on the CPU.
-            error: (B, H, W) mean over channels of |rendering - input|.
-            weights: (B, H, W) how much the pixels count; off the hand 0.
-        """
-        known = torch.nan_to_num(error) * weights
-        newest = known.sum(dim=(1, 2)) / weights.sum(dim=(1, 2)).clamp(min=1.0)
-        rows = upload(rows, self.residuals.device)
-        before = self.residuals[rows]
-        mixed = torch.where(before > 0.0, before + _FORGET * (newest - before), newest)
-        self.residuals.index_copy_(0, rows, mixed)
-
-    @torch.no_grad()
-    def shares(self, rows: Tensor) -> Tensor:
-        """(B,) in [0, 1] how much of B frames is explained; 0 while that is not known.
-
-        Args:
-            rows: (B,) int64, which of the R frames; on the CPU.
-        """
-        drawn = self._clean & (self.residuals > 0.0)
-        ordinary = torch.where(drawn, self.residuals, math.nan).nanmedian()
-        residual = self.residuals[upload(rows, self.residuals.device)]
-        found = torch.exp(-((residual / (self._tolerance * ordinary)) ** 2))
-        return torch.where((residual > 0.0) & ordinary.isfinite(), found, 0.0)
+        return (*(made * gradient for made in ctx.saved_tensors), None, None)
 
 
 class _Share(torch.autograd.Function):

@@ -69,7 +69,7 @@ def seen_anchors(
     found = {}
     for side, hand in hands.items():
         pixels, depth = places[side]
-        facing = _facing(hand, viewmats)
+        facing = facing_of(hand, viewmats)
         seen = facing > _FACING
         seen &= depth < read_images(nearest, pixels / _cell(size[0])) + _BEHIND
         found[side] = pixels, facing * seen
@@ -85,11 +85,15 @@ def _project(points: Tensor, viewmats: Tensor, Ks: Tensor) -> tuple[Tensor, Tens
     return pixels, torch.where(depth > 1e-6, depth, _FAR)
 
 
-def _facing(hand: AnchorPoses, viewmats: Tensor) -> Tensor:
+def facing_of(hand: AnchorPoses, viewmats: Tensor) -> Tensor:
     """(B, N) cosine between the anchors' normals and the directions to the camera."""
-    centres = -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:])[..., 0]
-    away = normalize(centres[:, None] - hand.positions, dim=-1)
+    away = normalize(camera_centres(viewmats)[:, None] - hand.positions, dim=-1)
     return (away * quat_third_axis(hand.orientations)).sum(dim=-1)
+
+
+def camera_centres(viewmats: Tensor) -> Tensor:
+    """(B, 3) world places of the cameras of (B, 4, 4) world to camera."""
+    return -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:])[..., 0]
 
 
 def _cell(height: int) -> float:

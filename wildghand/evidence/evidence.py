@@ -33,20 +33,15 @@ class EvidenceSettings:
     #: Share of the training frames that must show a Gaussian until half of its offset from the skin
     #: is kept.
     offset_share: float = number(0.08, 0.0, 100.0)
-    #: Share of the training frames that must show a place clearly until its colour is half its own;
-    #: the rest is that of the same place of the other hand, where that is known. 0: all of it is.
-    color_share: float = number(0.02, 0.0, 100.0)
     #: Share of the training frames that must show a place until its colour is half its own; the
-    #: rest is that of the skin around it. 0: all of it is its own.
+    #: rest is that of the skin around it and of the other hand. 0: all of it is its own.
     fill_share: float = number(0.02, 0.0, 100.0)
+    #: The same place of the other hand says as well what colour a place has.
+    other_hand: bool = True
 
     #: Share of the training frames that must show a Gaussian until half of its shape and
     #: transparency is kept: an image says more of these than of an offset.
     shape_share: ClassVar[float] = 0.002
-    #: After the last step, take a quarter or four times of `offset_share`, or 0, where that draws
-    #: the validation frames better, and nothing of it where that draws them much better; then five
-    #: times of `fill_share`, or 0. With fewer than four of these frames the settings hold.
-    validated: ClassVar[bool] = True
 
 
 _WALLS = "evidence_wall_"

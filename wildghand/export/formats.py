@@ -15,13 +15,14 @@ from hwp_bench.hands import load_template
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.render import shown_sides
 from wildghand.export.mesh import (
+    SIZE,
     SkinnedHand,
+    baked,
     capture_motion,
     closing_motion,
     require_skinning,
     skinned_glb_bytes,
 )
-from wildghand.export.splat_files import ply_bytes, splat_glb_bytes, spz_bytes
 from wildghand.export.splats import (
     HALF_TURN,
     MAX_DEGREE,
@@ -29,12 +30,14 @@ from wildghand.export.splats import (
     for_supersplat,
     harmonics,
     laid_to_rest,
+    ply_bytes,
     require_scale,
     scaled,
     seen,
+    splat_glb_bytes,
+    spz_bytes,
     standing,
 )
-from wildghand.export.texture import SIZE, baked
 
 #: Content by extension.
 FORMATS = {
@@ -73,14 +76,15 @@ def check_target(path: Path, settings: ExportSettings, *, overwrite: bool) -> No
             where=path,
             remedy=f"Use {known}.",
         )
-    if settings.mesh and suffix != ".glb":
-        raise UsageError("a mesh is written as .glb", where=path, field="--mesh")
-    if settings.mesh and settings.scale != 1.0:
-        raise UsageError("a mesh is in metres", where=path, field="--scale")
-    if settings.supersplat and suffix != ".ply":
-        raise UsageError("is for .ply", where=path, field="--supersplat")
-    if settings.supersplat and settings.scale != 1.0:
-        raise UsageError("sets the scale itself", where=path, field="--supersplat")
+    other = settings.scale != 1.0
+    for field, given, problem in (
+        ("--mesh", settings.mesh and suffix != ".glb", "a mesh is written as .glb"),
+        ("--scale", settings.mesh and other, "a mesh is in metres"),
+        ("--supersplat", settings.supersplat and suffix != ".ply", "is for .ply"),
+        ("--supersplat", settings.supersplat and other, "sets the scale itself"),
+    ):
+        if given:
+            raise UsageError(problem, where=path, field=field)
     require_scale(settings.scale)
     if not 0 <= settings.harmonics <= MAX_DEGREE:
         raise UsageError(f"is {settings.harmonics}", field="--harmonics", remedy="Use 0 to 3.")
@@ -135,10 +139,10 @@ def _splat_bytes(
     counts = {"gaussians": len(placed)}
     if suffix == ".ply":
         comments = (_GENERATOR, f"{scale:g} units are a metre", axes)
-        return ply_bytes(placed, comments, colors), counts
+        return ply_bytes(placed, colors, comments), counts
     if suffix == ".spz":
         return spz_bytes(placed, colors), counts
-    return splat_glb_bytes(placed, _GENERATOR, colors), counts
+    return splat_glb_bytes(placed, colors, _GENERATOR), counts
 
 
 def _mesh_bytes(
@@ -150,12 +154,10 @@ def _mesh_bytes(
     layouts = {side: load_template(avatar.hand_model.source, side) for side in rest}
     skinned = {}
     for side, pose in rest.items():
-        template = avatar.model.rigs[side].template
+        template, layout = avatar.model.rigs[side].template, layouts[side]
         require_skinning(template)
-        texture = baked(avatar, side, layouts[side], size)
-        skinned[side] = SkinnedHand(
-            template, layouts[side], np.asarray(pose.betas), np.asarray(pose.transl), texture
-        )
+        texture = baked(avatar, side, layout, size)
+        skinned[side] = SkinnedHand(template, layout, pose, texture)
     if capture is None:
         motion = closing_motion(layouts, rest)
     else:

@@ -15,7 +15,7 @@ import functools
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -35,6 +35,35 @@ from wildghand.network import HandFeatures
 _FIRST = 2.5
 #: What network and light say of the hands in a frame, by side.
 Predicted = Mapping[str, HandPrediction]
+Candidate = TypeVar("Candidate")
+
+
+def choose(
+    candidates: Iterable[tuple[Candidate, float]],
+    error: Callable[[Candidate], float],
+    start: tuple[Candidate, float] | None = None,
+    *,
+    patient: bool = True,
+) -> tuple[Candidate, float]:
+    """The candidate of lowest error, and its error.
+
+    Args:
+        candidates: each with the share by which it must lower the error of the best one before it.
+        start: the best one before them, and its error; None: the first of them, at least one.
+        patient: look at all of them; else only until one is no better.
+    """
+    listed = iter(candidates)
+    if start is None:
+        best, _ = next(listed)
+        start = best, error(best)
+    best, least = start
+    for candidate, gain in listed:
+        found = error(candidate)
+        if found < (1.0 - gain) * least:
+            best, least = candidate, found
+        elif not patient:
+            break
+    return best, least
 
 
 class ValidationFrames(Component):
@@ -54,116 +83,7 @@ class ValidationFrames(Component):
             self.drawings = JudgedDrawings(fit.model, data.training, refine, data.judges)
 
 
-class Averaging(Component):
-    """A fit ends with the mean of its last steps.
-
-    Attributes:
-        average: of everything that steps move.
-    """
-
-    average: StepAverage
-
-    def begin(self, fit: Fit) -> None:
-        """Note the first state."""
-        self.average = StepAverage(fit.descent.tensors(), fit.settings.schedule.average_share)
-
-    def after_step(self, fit: Fit) -> None:
-        """Note a step."""
-        self.average.take()
-
-    def forget(self) -> None:
-        """See `Component`."""
-        self.average.forget()
-
-    def checkpoint(self, avatar: Avatar) -> Avatar:
-        """See `Component`."""
-        return AveragedAvatar(avatar, self.average)
-
-    def after(self, fit: Fit) -> None:
-        """Put the mean in place."""
-        self.average.put()
-
-    def state_dict(self) -> dict[str, Any]:
-        """See `Component`."""
-        return self.average.state_dict()
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """See `Component`."""
-        self.average.load_state_dict(state)
-
-
-class StateChoice(Component):
-    """After the last step a fit goes back to an earlier state that draws validation frames better.
-
-    Evidence is chosen for the state that is kept, and has no say before.
-
-    Attributes:
-        states: kept along the fit.
-        judges: validation frames; None: the fit ends with its last state.
-        chosen: steps behind the state that was gone back to; None: it is the last one.
-    """
-
-    states: EarlierStates
-    judges: JudgedDrawings | None
-    chosen: int | None = None
-
-    def begin(self, fit: Fit) -> None:
-        """Keep states by how often the fit has seen its frames; none where nothing judges."""
-        averaging, frames = fit.part(Averaging), fit.part(ValidationFrames)
-        assert averaging is not None
-        self.judges = None if frames is None else frames.drawings
-        count, batch = len(fit.data.frames), fit.settings.schedule.batch
-        first = 0 if self.judges is None else max(1, round(_FIRST * count / batch))
-        self.states = EarlierStates(averaging.average, first)
-
-    def after_step(self, fit: Fit) -> None:
-        """Note a step."""
-        self.states.take()
-
-    def forget(self) -> None:
-        """See `Component`."""
-        self.states.forget()
-
-    def after(self, fit: Fit) -> None:
-        """Bring the model to the state that draws the validation frames best."""
-        if self.judges is None:
-            return
-        self.chosen = self.states.choose(self.error)
-        if self.chosen is not None:
-            fit.tell(
-                f"The state of step {self.chosen} draws the validation frames best; it is kept."
-            )
-
-    def error(self) -> float:
-        """Mean squared error of the validation frames as the model draws them now."""
-        assert self.judges is not None
-        changes = self.judges.model.color_changes
-        return self.judges.error(self.judges.predict_all(), None, changes)
-
-    def seconds_now(self, fit: Fit) -> float:
-        """About how long the choice among the states so far takes."""
-        count = len(self.states.candidates)
-        if self.judges is None or not count:
-            return 0.0
-        took = self.judges.seconds
-        each = took.features + (took.predict + took.draw) * len(self.judges.frames)
-        return (1 + count) * each
-
-    def record(self, fit: Fit, *, final: bool) -> dict[str, Any]:
-        """Steps behind the state that is kept, if it is an earlier one than the last."""
-        return {"chosen_steps": self.chosen}
-
-    def state_dict(self) -> dict[str, Any]:
-        """See `Component`."""
-        return self.states.state_dict()
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """See `Component`."""
-        self.states.load_state_dict(state)
-
-
-@dataclass(frozen=True)
-class DrawingSeconds:
+class DrawingSeconds(NamedTuple):
     """How long it takes to draw validation frames."""
 
     #: The network's features, which all frames share.
@@ -195,13 +115,10 @@ class JudgedDrawings:
     @torch.no_grad()
     def predict(self, row: int, features: Mapping[str, HandFeatures]) -> Predicted:
         """What network and light say of the hands in a frame."""
-        viewmats = self._clip.viewmats[row : row + 1]
+        here = slice(row, row + 1)
         return {
             side: self.model.predict_hand(
-                side,
-                (pose[row : row + 1], betas, transl[row : row + 1]),
-                viewmats,
-                features[side],
+                side, (pose[here], betas, transl[here]), self._clip.viewmats[here], features[side]
             )
             for side, (pose, betas, transl) in self._clip.parameters.items()
         }
@@ -286,25 +203,34 @@ class JudgedDrawings:
         return image[0]
 
 
-class StepAverage:
-    """A running mean of tensors, in which a step counts the more, the later it is.
+class Averaging(Component):
+    """A fit ends with a running mean of its steps; a step counts the more, the later it is.
 
     After T steps, step t has about the weight (t / T) ** (1 / share - 1): nearly everything comes
-    from the last `share` of them, whenever the fit ends.
+    from the last `share` of them, whenever the fit ends. With a share of 0 it is the last step
+    alone, with 1 all of them alike.
 
     Source: Shamir and Zhang, "Stochastic gradient descent for non-smooth optimization",
     polynomial-decay averaging, with eta = 1 / share - 1.
 
     Args:
-        tensors: what steps move; they are read at each call.
-        share: of the steps, in [0, 1]; 0: the last step alone, 1: all of them alike.
+        tensors: what steps move; they are read at each call. `begin` takes those of the fit.
+        share: of the steps, in [0, 1].
     """
 
-    def __init__(self, tensors: Iterable[Tensor], share: float) -> None:
+    def __init__(self, tensors: Iterable[Tensor] = (), share: float = 0.0) -> None:
         self._tensors = list(tensors)
         self._share = share
         self._steps = 0
         self._means: list[Tensor] = []
+
+    def begin(self, fit: Fit) -> None:
+        """Take what the fit's steps move."""
+        self._tensors, self._share = fit.descent.tensors(), fit.settings.schedule.average_share
+
+    def after_step(self, fit: Fit) -> None:
+        """Take note of a step."""
+        self.take()
 
     @torch.no_grad()
     def take(self) -> None:
@@ -313,16 +239,20 @@ class StepAverage:
             return
         self._steps += 1
         if not self._means:
-            self._means = [tensor.detach().clone() for tensor in self._tensors]
+            self._means = self.now()
             return
         weight = 1.0 / (1.0 + self._share * (self._steps - 1))
         for mean, tensor in zip(self._means, self._tensors, strict=True):
             mean.lerp_(tensor, weight)
 
+    def after(self, fit: Fit) -> None:
+        """Put the mean in place."""
+        self.put()
+
     def put(self) -> None:
         """Put the means in place of the tensors; without a step these stay."""
         if self._means:
-            _copy(self._means, self._tensors)
+            self.restore(self._means)
 
     def values(self) -> list[Tensor]:
         """Copies of what `put` would put in place."""
@@ -332,9 +262,13 @@ class StepAverage:
         """Copies of the tensors as they are."""
         return [tensor.detach().clone() for tensor in self._tensors]
 
+    @torch.no_grad()
     def restore(self, values: Iterable[Tensor]) -> None:
         """Put what `values` or `now` returned in place of the tensors."""
-        _copy(values, self._tensors)
+        for value, tensor in zip(values, self._tensors, strict=True):
+            # Past autograd's count of changes: a graph that several steps share stays open
+            # meanwhile, and finds the values that it was made of when it is used.
+            tensor.data.copy_(value)
 
     def forget(self) -> None:
         """Begin again, as before the first step."""
@@ -350,66 +284,84 @@ class StepAverage:
         finally:
             self.restore(kept)
 
+    def checkpoint(self, avatar: Avatar) -> Avatar:
+        """See `Component`."""
+        return AveragedAvatar(avatar, self)
+
     def state_dict(self) -> dict[str, Any]:
-        """The state for `load_state_dict`."""
+        """See `Component`."""
         return {"steps": self._steps, "means": list(self._means)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from a saved state."""
+        """See `Component`."""
         self._steps = int(state["steps"])
         self._means = [mean.clone() for mean in state["means"]]
 
 
-@torch.no_grad()
-def _copy(values: Iterable[Tensor], tensors: Iterable[Tensor]) -> None:
-    for value, tensor in zip(values, tensors, strict=True):
-        # Past autograd's count of changes: a graph that several steps share stays open meanwhile,
-        # and finds the values that it was made of when it is used.
-        tensor.data.copy_(value)
-
-
+@dataclass(frozen=True, eq=False)
 class AveragedAvatar:
-    """An avatar in the middle of a fit, drawn as it would be if the fit ended here.
+    """An avatar in the middle of a fit, drawn as it would be if the fit ended here."""
 
-    Args:
-        avatar: of the tensors that steps move.
-        average: of these.
-    """
-
-    def __init__(self, avatar: Avatar, average: StepAverage) -> None:
-        self._avatar = avatar
-        self._average = average
+    avatar: Avatar
+    #: Of the tensors that the avatar is drawn from.
+    average: Averaging
 
     @property
     def device(self) -> str:
         """Where it is drawn."""
-        return str(getattr(self._avatar, "device", "cpu"))
+        return str(getattr(self.avatar, "device", "cpu"))
 
     def render(self, hands: Mapping[str, HandPose], camera: Camera) -> np.ndarray:
         """See `hwp_bench.methods.contract.Avatar`."""
-        with self._average.in_place():
-            return self._avatar.render(hands, camera)
+        with self.average.in_place():
+            return self.avatar.render(hands, camera)
 
 
-class EarlierStates:
-    """Means of a fit's steps, kept after some of them and each time after twice as many.
+class StateChoice(Component):
+    """After the last step a fit goes back to an earlier state that draws validation frames better.
+
+    States are means of its steps, kept after some of them and each time after twice as many.
+    Evidence is chosen for the state that is kept, and has no say before.
 
     Args:
-        average: the mean of the steps so far.
+        average: the mean of the steps so far. `begin` takes that of the fit.
         first: steps until the first state is kept, at least 1; 0: none ever is.
+
+    Attributes:
+        judges: validation frames; None: the fit ends with its last state.
+        chosen: steps behind the state that was gone back to; None: it is the last one.
     """
 
-    def __init__(self, average: StepAverage, first: int) -> None:
-        self._average = average
+    judges: JudgedDrawings | None
+    chosen: int | None = None
+
+    def __init__(self, average: Averaging | None = None, first: int = 0) -> None:
+        self._average = average or Averaging()
         self._first = first
         self._steps = 0
         self._kept: dict[int, list[Tensor]] = {}
+
+    def begin(self, fit: Fit) -> None:
+        """Keep states by how often the fit has seen its frames; none where nothing judges."""
+        averaging, frames = fit.part(Averaging), fit.part(ValidationFrames)
+        assert averaging is not None
+        self._average = averaging
+        self.judges = None if frames is None else frames.drawings
+        self._first = 0 if self.judges is None else max(1, round(_FIRST * fit.epoch))
+
+    def after_step(self, fit: Fit) -> None:
+        """Take note of a step."""
+        self.take()
 
     def take(self) -> None:
         """Take note of a step, after the average has."""
         self._steps += 1
         if self._steps == self._first * 2 ** len(self._kept):
             self._kept[self._steps] = self._average.values()
+
+    def forget(self) -> None:
+        """See `Component`."""
+        self._steps, self._kept = 0, {}
 
     @property
     def candidates(self) -> list[int]:
@@ -419,31 +371,57 @@ class EarlierStates:
         """
         return [step for step in sorted(self._kept, reverse=True) if 2 * step <= self._steps]
 
-    def choose(self, error: Callable[[], float]) -> int | None:
+    def after(self, fit: Fit) -> None:
+        """Bring the model to the state that draws the validation frames best."""
+        if self.judges is None:
+            return
+        self.chosen = self.go_back(self.error)
+        if self.chosen is not None:
+            fit.tell(
+                f"The state of step {self.chosen} draws the validation frames best; it is kept."
+            )
+
+    def go_back(self, error: Callable[[], float]) -> int | None:
         """Go back, from the state that is there, as long as that makes an error smaller."""
         candidates = self.candidates
         if not candidates:
             return None
-        best, chosen, least = self._average.now(), None, error()
-        for step in candidates:
-            self._average.restore(self._kept[step])
-            found = error()
-            if not found < least:
-                break
-            best, chosen, least = self._kept[step], step, found
-        self._average.restore(best)
-        return chosen
+        steps: list[int | None] = [None, *candidates]
+        states = [self._average.now(), *(self._kept[step] for step in candidates)]
 
-    def forget(self) -> None:
-        """Begin again, as before the first step."""
-        self._steps, self._kept = 0, {}
+        def error_of(row: int) -> float:
+            self._average.restore(states[row])
+            return error()
+
+        chosen, _ = choose([(row, 0.0) for row in range(len(steps))], error_of, patient=False)
+        self._average.restore(states[chosen])
+        return steps[chosen]
+
+    def error(self) -> float:
+        """Mean squared error of the validation frames as the model draws them now."""
+        assert self.judges is not None
+        changes = self.judges.model.color_changes
+        return self.judges.error(self.judges.predict_all(), None, changes)
+
+    def seconds_now(self, fit: Fit) -> float:
+        """About how long the choice among the states so far takes."""
+        count = len(self.candidates)
+        if self.judges is None or not count:
+            return 0.0
+        took = self.judges.seconds
+        each = took.features + (took.predict + took.draw) * len(self.judges.frames)
+        return (1 + count) * each
+
+    def record(self, fit: Fit, *, final: bool) -> dict[str, Any]:
+        """Steps behind the state that is kept, if it is an earlier one than the last."""
+        return {"chosen_steps": self.chosen}
 
     def state_dict(self) -> dict[str, Any]:
-        """The state for `load_state_dict`."""
+        """See `Component`."""
         return {"steps": self._steps, "kept": dict(self._kept)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from a saved state."""
+        """See `Component`."""
         self._steps = int(state["steps"])
         self._kept = {
             int(step): [value.clone() for value in values] for step, values in state["kept"].items()

@@ -1,9 +1,9 @@
 """Colours of places that frames do not show well: before the fit, and after it.
 
 Before it, the identity map starts from the frames' colours where no skin has these (`StartColors`).
-After it, a hand takes the colours of the other hand (`OtherHand`), and places that few frames have
-shown take those of the skin around them (`FilledColors`). These two compare colours under the light
-that the clip shows, as logarithms of linear light.
+After it, places that few frames have shown take the colours of the skin around them and of the
+same place of the other hand (`FilledColors`), compared under the light that the clip shows, as
+logarithms of linear light.
 """
 
 from __future__ import annotations
@@ -19,18 +19,17 @@ import torch
 from torch import Tensor
 
 from hwp_bench.base.colors import linear_to_srgb, srgb_to_linear
-from wildghand.evidence import ColorChanges, kept_share, shown_frames
+from wildghand.evidence import ColorChanges, kept_share
 from wildghand.evidence.count import read_images, seen_anchors
-from wildghand.fitting.data import FitData
 from wildghand.fitting.fit import Component, Fit
-from wildghand.fitting.light import Shadows, best_of_each_part
+from wildghand.fitting.light import Lighting, best_of_each_part
 from wildghand.gaussians.attributes import CHANNELS, SIZES
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.regularizers import nearest_on_surface, rest_anchors
 from wildghand.gaussians.rig import HandRig
 from wildghand.gaussians.training import TrainingClip
 from wildghand.light import KnownLight
-from wildghand.light.lights import ring_around
+from wildghand.light.light import ring_around
 from wildghand.model.model import WildGHandModel
 from wildghand.network.surface import Chart, PlaneSampler
 
@@ -53,8 +52,6 @@ _COLORS = slice(CHANNELS - SIZES["logit_colors"], CHANNELS)
 _RING, _INSIDE = 4, 0.6
 # sRGB nearer to 0 or 1, and linear light below this, say nothing.
 _EDGE, _DARKEST = 0.005, 1e-3
-# Weight of a frame from which its colours begin to count; what perturbs a frame changes them.
-_UNSURE = 0.35
 # A colour that is somebody's is better than none: it takes so much less to be lent.
 _LENT = 0.25
 _OTHER = {"left": "right", "right": "left"}
@@ -79,72 +76,14 @@ class StartColors(Component):
         start_from_colors(fit)
 
 
-class OtherHand(Component):
-    """Where clean frames have shown a place of one hand alone, the other hand takes its colour.
-
-    Both hands of a person look alike. The network alone does not do this: each hand has a map of
-    its own.
-
-    Attributes:
-        own: (N,) by side in [0, 1), how far each Gaussian's colour is the hand's own; empty:
-            nothing is taken.
-        lent: (N,) by side in [0, 1), how far it is good enough for the other hand.
-    """
-
-    def __init__(self) -> None:
-        self.own: Mapping[str, np.ndarray] = {}
-        self.lent: Mapping[str, np.ndarray] = {}
-
-    def before(self, fit: Fit) -> None:
-        """Count what clean frames show of each of two hands."""
-        if len(fit.model.rigs) < 2:
-            return
-        count = len(fit.data.frames)
-        shown = shown_frames(
-            fit.model.rigs, fit.clip, functools.partial(clearly_visible, fit.data), count
-        )
-        half = fit.settings.evidence.color_share * count
-
-        def shares(half: float) -> dict[str, np.ndarray]:
-            return {side: kept_share(n, half).cpu().double().numpy() for side, n in shown.items()}
-
-        self.own, self.lent = shares(half), shares(_LENT * half)
-
-    def after(self, fit: Fit) -> None:
-        """Give each hand the colours that it takes."""
-        found = self.learn(fit)
-        if found is not None:
-            fit.model.keep(found)
-
-    @torch.no_grad()
-    def learn(self, fit: Fit) -> ColorChanges | None:
-        """The colours that the hands take; None where they take none.
-
-        They are compared at normals that the clip's light knows; without a light nothing is taken.
-        """
-        light = fit.model.light
-        if not self.own or light is None:
-            return None
-        logits = {side: known_logits(fit.model, fit.clip, side, light) for side in self.own}
-        levels = {side: log_linear(values) for side, values in logits.items()}
-        mixed = {}
-        for side, level in levels.items():
-            difference = levels[_OTHER[side]] - level
-            mixed[side] = level + self.taken(side)[:, None] * difference
-        return changes_to(mixed, logits, fit.device)
-
-    def taken(self, side: str) -> np.ndarray:
-        """(N,) in [0, 1), how much of the other hand's colours a hand takes; of two hands."""
-        return (1.0 - self.own[side]) * self.lent[_OTHER[side]]
-
-
 @dataclass(eq=False)
 class FilledColors:
-    """The colours that places take from the skin around them, which few frames have shown or none.
+    """The colours that places take which few frames have shown or none.
 
     The network's colours of such places are nobody's: they began as the prior's and went where the
-    weights went that other places moved, which leaves blotches. What is known of the skin is
-    carried on to them as smoothly as can be.
+    weights went that other places moved, which leaves blotches. Both hands of a person look alike:
+    what is known of the same place of the other hand comes first. Then what is known of the skin is
+    carried on as smoothly as can be.
     """
 
     #: Of one or two hands.
@@ -153,18 +92,20 @@ class FilledColors:
     shown: Mapping[str, Tensor]
 
     def carried_on(self, shares: Sequence[float]) -> list[ColorChanges | None]:
-        """All changes of colours, those of the model and those of places that are seldom shown."""
-        light, before = self.fit.model.light, self.fit.model.color_changes
-        if light is None or not any(share > 0.0 for share in shares):
-            return [before] * len(shares)
-        logits, levels = {}, {}
-        for side in self.fit.model.rigs:
-            logits[side] = known_logits(self.fit.model, self.fit.clip, side, light)
-            change = 0.0 if before is None else before.changes[side].double().cpu().numpy()
-            levels[side] = log_linear(logits[side] + change)
-        device = self.fit.device
+        """The changes of colours for some values of `evidence.fill_share`; None: nothing changes.
+
+        With a share of 0 the skin around a place says nothing of it, and the other hand all the
+        same. Colours are compared at normals that the clip's light knows; without one none change.
+        """
+        model, clip, light = self.fit.model, self.fit.clip, self.fit.model.light
+        if light is None or not self.fit.settings.evidence.fill_share:
+            return [None] * len(shares)
+        logits = {side: known_logits(model, clip, side, light) for side in model.rigs}
+        levels = {side: log_linear(values) for side, values in logits.items()}
         return [
-            changes_to(self._filled(levels, share), logits, device) if share > 0.0 else before
+            changes_to(self._filled(levels, share), logits, self.fit.device)
+            if share > 0.0 or self._joined
+            else None
             for share in shares
         ]
 
@@ -173,24 +114,30 @@ class FilledColors:
         rigs = self.fit.model.rigs
         self._filled({side: np.zeros((len(rig), 3)) for side, rig in rigs.items()}, 1.0)
 
+    @property
+    def _joined(self) -> bool:
+        return len(self.fit.model.rigs) == 2 and self.fit.settings.evidence.other_hand
+
     def _filled(self, levels: Mapping[str, np.ndarray], share: float) -> dict[str, np.ndarray]:
-        return {
-            side: smooth_fill(self._roughness[side], values, self._known(side, share))
-            for side, values in levels.items()
-        }
+        half = (share or self.fit.settings.evidence.fill_share) * len(self.fit.data.frames)
+        found = {}
+        for side, values in levels.items():
+            known = self._kept(side, half)
+            if self._joined:
+                other = _OTHER[side]
+                taken = (1.0 - known) * self._kept(other, _LENT * half)
+                values = values + taken[:, None] * (levels[other] - values)
+                known = 1.0 - (1.0 - known) * (1.0 - taken)
+            found[side] = smooth_fill(self._roughness[side], values, known) if share else values
+        return found
+
+    def _kept(self, side: str, half: float) -> np.ndarray:
+        """(N,) in [0, 1), how far the colours of a hand are known."""
+        return np.asarray(kept_share(self.shown[side].double().cpu(), half))
 
     @functools.cached_property
     def _roughness(self) -> dict[str, Any]:
         return {side: roughness(rig) for side, rig in self.fit.model.rigs.items()}
-
-    def _known(self, side: str, share: float) -> np.ndarray:
-        """(N,) in [0, 1), how far a Gaussian's colour is known, from either hand."""
-        frames = self.shown[side].double().cpu()
-        known: np.ndarray = kept_share(frames, share * len(self.fit.data.frames)).numpy()
-        other = self.fit.part(OtherHand)
-        if other is not None and other.own:
-            known = 1.0 - (1.0 - known) * (1.0 - other.taken(side))
-        return known
 
 
 @torch.no_grad()
@@ -200,7 +147,7 @@ def start_from_colors(fit: Fit) -> None:
     The shadows and the light are taken out of the colours. Nothing is random. A network without a
     direct path from map to attributes stays as it is.
     """
-    model, clip, data, cast = fit.model, fit.clip, fit.data, fit.part(Shadows)
+    model, clip, data, cast = fit.model, fit.clip, fit.data, fit.part(Lighting)
     direct = model.network.attribute_head.direct
     if direct is None:
         return
@@ -242,8 +189,7 @@ def tint_share(off: Tensor) -> Tensor:
 def _lit(model: WildGHandModel, normals: Tensor, dark: Tensor | None) -> Tensor:
     """(B, N, 1) factors of light and shadows on colours of (B, N) places."""
     lit = torch.ones_like(normals[..., 0]) if dark is None else dark
-    shading = None if model.shadows is None else model.shadows.shading(normals)
-    return (lit if shading is None else lit * shading)[..., None]
+    return (lit if model.shadows is None else lit * model.shadows.shading(normals))[..., None]
 
 
 def _logits(colors: Tensor) -> Tensor:
@@ -267,23 +213,11 @@ def _spread(sampler: PlaneSampler, values: Tensor, weights: Tensor) -> Tensor:
     return asked[:, :-1] / (asked[:, -1:] + _CELL)
 
 
-def clearly_visible(data: FitData, rows: Tensor) -> Tensor:
-    """How much pixels say of a hand's colour: as `visible`, but of frames that are sure alone."""
-    weights = data.judgement.frame_weights
-    sure = ((weights - _UNSURE) / (1.0 - _UNSURE)).clamp(0.0, 1.0) / weights.clamp(min=1e-3)
-    says = data.visible(rows)
-    return says * sure[rows].to(says)[:, None, None]
-
-
 @torch.no_grad()
 def known_logits(
     model: WildGHandModel, clip: TrainingClip, side: str, light: KnownLight
 ) -> np.ndarray:
-    """Mean colour of each Gaussian over known normals and poses of the clip.
-
-    Returns:
-        (N, 3) in logits of sRGB.
-    """
+    """(N, 3) mean colour of each Gaussian over known normals and poses of the clip, in logits."""
     poses = clip.parameters[side][0]
     normals = known_normals(light).to(poses)
     rows = torch.linspace(0, len(poses) - 1, len(normals)).long().to(poses.device)

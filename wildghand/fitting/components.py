@@ -6,12 +6,12 @@ import torch
 
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.fitting.choice import Averaging, StateChoice, ValidationFrames
-from wildghand.fitting.colors import OtherHand, StartColors
-from wildghand.fitting.disentangle import Dpd
+from wildghand.fitting.colors import StartColors
+from wildghand.fitting.disentangle import Dpd, GeometryDropout
 from wildghand.fitting.evidence import FewShown
 from wildghand.fitting.fit import Component, Fit
 from wildghand.fitting.judging import HandMasks, HiddenSkin, Prepass
-from wildghand.fitting.light import Shadows, UnseenLight
+from wildghand.fitting.light import Lighting
 from wildghand.fitting.objective import Reconstruction, Regularisers
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
 from wildghand.fitting.start import Person, Poses, StartFromPrior
@@ -22,11 +22,11 @@ from wildghand.model.settings import WildGHandSettings
 def components_of(settings: WildGHandSettings) -> list[Component]:
     """The components of a fit, in the order in which their hooks are called.
 
-    Hands and frames are corrected and judged first, then colours and light are found, and the loss
-    is put together; what ends a fit comes last.
+    Hands and frames are corrected and judged first; then come the mean and the choice of the steps,
+    as light and colours are found for the state that a fit ends with, and the parts of the loss.
     """
     pao, evidence = settings.pao, settings.evidence
-    chosen = settings.schedule.validated or (evidence.enabled and evidence.validated)
+    chosen = settings.schedule.validated or evidence.enabled
     by_regions = pao.enabled and pao.variant != "binary"
     listed: list[tuple[bool, type[Component]]] = [
         (settings.poses.enabled, Poses),
@@ -35,17 +35,16 @@ def components_of(settings: WildGHandSettings) -> list[Component]:
         (pao.hand != "estimated", HandMasks),
         (bool(settings.prior), StartFromPrior),
         (chosen, ValidationFrames),
-        (settings.shadows.enabled, Shadows),
+        (True, Averaging),
+        (settings.schedule.validated, StateChoice),
+        (settings.shadows.enabled or settings.light.enabled, Lighting),
         (settings.start_colors, StartColors),
         (settings.terms.leave_hidden, HiddenSkin),
         (True, Reconstruction),
         (True, Pao if by_regions else MaskWeights),
         (True, Regularisers),
         (settings.dpd.enabled, Dpd),
-        (True, Averaging),
-        (settings.schedule.validated, StateChoice),
-        (settings.light.enabled, UnseenLight),
-        (evidence.enabled and evidence.color_share > 0.0, OtherHand),
+        (settings.schedule.geometry_dropout > 0.0, GeometryDropout),
         (evidence.enabled, FewShown),
     ]
     return [kind() for wanted, kind in listed if wanted]

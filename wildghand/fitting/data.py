@@ -22,6 +22,7 @@ from wildghand.gaussians.training import (
     load_frames,
     load_validation_frames,
     shares_of_255,
+    upload,
 )
 from wildghand.subject import SubjectShape
 from wildghand.subject.fit_subject import LEAST_CHOOSING, MOST_CHOOSING
@@ -124,6 +125,24 @@ class FitData:
     def masks(self) -> FrameTable:
         """(H, W) coverage of the visible hand in each frame."""
         return self.frames.masks_on(self.device)
+
+    @functools.cached_property
+    def whole_images(self) -> FrameTable:
+        """(H, W, 3) sRGB of each frame, its background included."""
+        images, device = self.frames.images, self.device
+        size = 4 * images[0].numel()
+        return FrameTable(
+            lambda rows: shares_of_255(images[rows], device), len(images), size, device
+        )
+
+    @functools.cached_property
+    def silhouettes(self) -> FrameTable:
+        """(H, W) bool, where the posed hands would be seen if nothing covered them."""
+        drawn = torch.from_numpy(np.stack(self.places) > 0)
+        device = self.device
+        return FrameTable(
+            lambda rows: upload(drawn[rows], device), len(drawn), drawn[0].numel(), device
+        )
 
     def uncovered(self, rows: Tensor) -> Tensor | None:
         """(B, H, W) in [0, 1], what the pre-pass leaves of the pixels of B frames; None: all."""

@@ -1,4 +1,4 @@
-"""DPD in a fit: biases of frames, their temporal weights, and the frames' gains."""
+"""What steps leave out at random: DPD's biases of frames, and the geometry branch."""
 
 from __future__ import annotations
 
@@ -17,8 +17,35 @@ from wildghand.model import terms
 from wildghand.model.frames import RenderedFrames
 
 
-class Dpd(Component):
-    """Perturbations are explained as biases, which are left out of some steps at random.
+class Dropout(Component):
+    """Something is left out of some steps, by a random generator of its own."""
+
+    def before(self, fit: Fit) -> None:
+        """Seed the generator."""
+        self._generator = torch.Generator().manual_seed(fit.seed)
+
+    def state_dict(self) -> dict[str, Any]:
+        """See `Component`."""
+        return {"generator": self._generator.get_state()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """See `Component`."""
+        self._generator.set_state(state["generator"].cpu())
+
+
+class GeometryDropout(Dropout):
+    """Head (i) sees the texture branch alone in some frames, an option of the authors' code."""
+
+    def draws(self, fit: Fit, batch: Batch) -> DrawOptions:
+        """Which frames of a batch are drawn so, (B,) bool."""
+        if not batch.stepping:
+            return {}
+        chances = torch.full(batch.rows.shape, fit.settings.schedule.geometry_dropout)
+        return {"plain": upload(~draw_kept(chances, self._generator), fit.device)[batch.part]}
+
+
+class Dpd(Dropout):
+    """Perturbations are explained as biases, which are left out of some steps.
 
     Attributes:
         temporal: what holds the temporal weights; None: nothing.
@@ -29,22 +56,19 @@ class Dpd(Component):
 
     def before(self, fit: Fit) -> None:
         """Bring temporal weights to what the pre-pass found."""
-        settings, count = fit.settings.dpd, len(fit.data.frames)
-        self._generator = torch.Generator().manual_seed(fit.seed)
+        super().before(fit)
+        settings = fit.settings.dpd
         self.temporal: TemporalTarget | None = None
-        self.drop = torch.full((count,), settings.omega_dropout)
+        self.drop = torch.full((len(fit.data.frames),), settings.omega_dropout)
         prepass = fit.part(Prepass)
-        if prepass is not None:
+        if prepass is not None and settings.additions:
             self.drop = torch.from_numpy(prepass.assessment.omega_dropout).float()
             self.temporal = TemporalTarget.judged(
-                fit.data.judgement.clean.to(fit.device),
                 fit.data.judgement.frame_weights.to(fit.device),
                 settings.omega_scale,
                 fit.settings.prepass.weight_floor,
             )
             self.temporal.begin(fit.model.biases)
-        if not settings.biases:
-            self.drop = torch.ones(count)
 
     def draws(self, fit: Fit, batch: Batch) -> DrawOptions:
         """Which frames of a batch keep their biases in this step, (B,) bool by side."""
@@ -65,7 +89,7 @@ class Dpd(Component):
         if self.temporal is not None and settings.omega_weight:
             held = self.temporal.temporal_loss(model.biases, int(rows[0]))
             yield settings.omega_weight * held
-        if settings.gains:
+        if settings.additions:
             gains = model.log_gains[upload(rows, fit.device)]
             clean = upload(fit.data.judgement.clean[rows], fit.device)
             yield settings.gain_weight * terms.gain_of_clean(gains, clean)
@@ -84,11 +108,3 @@ class Dpd(Component):
                 for side in model.perturbation
             }
         }
-
-    def state_dict(self) -> dict[str, Any]:
-        """See `Component`."""
-        return {"generator": self._generator.get_state()}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """See `Component`."""
-        self._generator.set_state(state["generator"].cpu())

@@ -25,7 +25,7 @@ from wildghand.evidence import (
     strengths,
     weigh_evidence,
 )
-from wildghand.fitting.choice import JudgedDrawings, ValidationFrames
+from wildghand.fitting.choice import JudgedDrawings, ValidationFrames, choose
 from wildghand.fitting.colors import FilledColors
 from wildghand.fitting.fit import Component, Fit
 from wildghand.gaussians.training import TrainingClip
@@ -139,7 +139,7 @@ class FewShown(Component):
         model.keep(weigh_evidence(self.shown, count, fit.settings.evidence))
         self.gaps = Gaps(model, fit.clip, data.visible, count)
         self.filled = FilledColors(fit, self.shown)
-        frames = fit.part(ValidationFrames) if fit.settings.evidence.validated else None
+        frames = fit.part(ValidationFrames)
         self.judges = None if frames is None else frames.drawings
 
     def after(self, fit: Fit) -> None:
@@ -161,7 +161,7 @@ class FewShown(Component):
         found: list[Evidence | ColorChanges] = []
         if not evidence.equals(fit.model.evidence):
             found.append(evidence)
-        if colors is not None and colors is not fit.model.color_changes:
+        if colors is not None:
             found.append(colors)
         return found
 
@@ -174,25 +174,25 @@ class FewShown(Component):
         self, fit: Fit, judges: JudgedDrawings, several: Sequence[Evidence]
     ) -> tuple[Evidence, ColorChanges | None]:
         """One evidence of several, and with it the changes of colours."""
-        predicted = judges.predict_all()
-        changes = fit.model.color_changes
-        errors = [judges.error(predicted, each, changes) for each in several]
-        least = min(errors)
+        predicted, opened = judges.predict_all(), frozenset(fit.model.rigs)
+
+        def error(evidence: Evidence) -> float:
+            return judges.error(predicted, evidence, None)
+
         # Of equal ones the first is taken, which is the settings' own.
-        best = several[errors.index(least)]
-        opened = frozenset(fit.model.rigs)
-        for other, share in (
+        best, least = choose([(each, 0.0) for each in several], error)
+        others = (
             (replace(best, open_wrists=opened), _IN_THE_WAY),
             (best.spare_all(), _AS_LEARNT),
             (replace(best.spare_all(), open_wrists=opened), _AS_LEARNT),
-        ):
-            error = judges.error(predicted, other, changes)
-            if error < (1.0 - share) * least:
-                best, least = other, error
-        if fit.model.light is not None:
-            fills = self.filled.carried_on(fill_shares(fit.settings.evidence))
-            changes = min(fills, key=lambda each: judges.error(predicted, best, each))
-        return best, changes
+        )
+        best, _ = choose(others, error, (best, least))
+        if fit.model.light is None:
+            return best, None
+        fills = self.filled.carried_on(fill_shares(fit.settings.evidence))
+        several_fills = [(each, 0.0) for each in fills]
+        colors, _ = choose(several_fills, lambda each: judges.error(predicted, best, each))
+        return best, colors
 
     def seconds(self, fit: Fit) -> float:
         """See `Component`."""

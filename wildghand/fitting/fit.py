@@ -60,7 +60,7 @@ class FrameTarget:
     image: Tensor
     #: (B, H, W) estimated coverage of the visible hand.
     hand: Tensor
-    #: (B, H, W) weight of each pixel within its frame.
+    #: (B, H, W) weight of each pixel within its frame; a gradient may go through it.
     weights: Tensor
     #: (B,) means of PAO's weights, which the loss rewards; None without regions.
     sizes: Tensor | None = None
@@ -74,6 +74,7 @@ class DrawOptions(TypedDict, total=False):
     move: bool
     features: Features
     dark: Mapping[str, Tensor]
+    plain: Tensor
 
 
 class Component:
@@ -181,6 +182,8 @@ class Fit(IterativeFit[WildGHandAvatar]):
         self.device = device
         self.world = world
         self.components = components
+        self.plateau_steps = settings.schedule.plateau_steps
+        self.shared_steps = settings.schedule.texture_every
         self.data = FitData(training, device)
         for component in components:
             component.prepare(self)
@@ -193,19 +196,22 @@ class Fit(IterativeFit[WildGHandAvatar]):
         for component in components:
             component.before(self)
         others = {name: group for c in components for name, group in c.parameters().items()}
-        self.descent = Descent(self.model, others, settings.schedule, self._loss_of_features)
+        self.descent = Descent(
+            self.model, others, settings.schedule, self._loss_of_features, self.epoch
+        )
         for component in components:
             component.begin(self)
 
     @property
-    def plateau_steps(self) -> int:  # type: ignore[override]
-        """See `IterativeFit`."""
-        return self.settings.schedule.plateau_steps
+    def batch(self) -> int:
+        """Frames in each step."""
+        # The authors give each process as many frames as there are hands.
+        return self.settings.schedule.batch or len(self.data.training.sides) * self.world.size
 
     @property
-    def shared_steps(self) -> int:  # type: ignore[override]
-        """See `IterativeFit`."""
-        return self.settings.schedule.texture_every
+    def epoch(self) -> float:
+        """Steps that look at as many frames as there are."""
+        return len(self.data.frames) / self.batch
 
     def part(self, kind: type[Kind]) -> Kind | None:
         """The component of a kind; None where it is left out."""
@@ -213,11 +219,14 @@ class Fit(IterativeFit[WildGHandAvatar]):
 
     def count_steps(self, budget: Budget) -> int:
         """See `IterativeFit`."""
-        return self.settings.schedule.steps if budget.steps is None else budget.steps
+        schedule = self.settings.schedule
+        if budget.steps is not None:
+            return budget.steps
+        return math.ceil(schedule.epochs * self.epoch) if schedule.epochs else schedule.steps
 
     def batches(self) -> Iterator[Tensor]:
         """See `IterativeFit`: (B,) int64 each."""
-        return batches(len(self.data.frames), self.settings.schedule.batch, self.seed)
+        return batches(len(self.data.frames), self.batch, self.seed)
 
     def step(self, batch: Tensor, fraction: float) -> Loss:
         """Take one step on a batch, of which each process draws its part.
@@ -388,7 +397,7 @@ class Fit(IterativeFit[WildGHandAvatar]):
         if not pao.enabled:
             return masks
         # The paper's equations have no bound: 255 is the largest weight of a frame.
-        least = 1e-12 if pao.variant == "printed" else 1.0
+        least = 1e-12 if pao.variant in ("printed", "released") else 1.0
         for row in evenly(len(frames), MAX_MASKS).tolist():
             batch = Batch(torch.tensor([row]))
             weights = self.compare(batch, self.draw(batch)).weights[0]

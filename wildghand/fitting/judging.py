@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import cv2
@@ -10,11 +10,10 @@ import numpy as np
 import torch
 
 from hwp_bench.base.console import track
-from hwp_bench.hands import HandTemplate, pose_hand, project
-from hwp_bench.hands.raster import draw_faces
+from hwp_bench.hands import pose_hand, project
 from hwp_bench.methods.contract import TrainingCapture
 from hwp_bench.methods.settings import source_path
-from wildghand.fitting.data import Judgement
+from wildghand.fitting.data import FitData, Judgement
 from wildghand.fitting.fit import Batch, Component, DrawOptions, Fit, FrameTarget
 from wildghand.gaussians.training import FrameTable, TrainingFrames, upload
 from wildghand.model.frames import RenderedFrames
@@ -25,8 +24,6 @@ from wildghand.prepass import FrameAssessment, PrepassInput, judge_frames
 #: How far inside the posed hand's outline a pixel must lie to count as hidden, as a share of the
 #: image's height: closer to it a mask leaves a pixel out because the given pose is not exact.
 MARGIN = 0.0085
-# Frames that are posed at a time, so that memory does not grow with the clip.
-_CHUNK = 32
 
 
 class Prepass(Component):
@@ -53,7 +50,7 @@ class Prepass(Component):
                 templates=bent,
             )
 
-        judges = data.judges if settings.validated else None
+        judges = data.judges
         found = judge_frames(
             given(data.frames), settings, None if judges is None else given(judges)
         )
@@ -84,10 +81,7 @@ class HandMasks(Component):
 
     def prepare(self, fit: Fit) -> None:
         """Put what is found in place of the estimated masks."""
-        data = fit.data
-        data.replace_masks(
-            hand_masks(data.training, data.frames, fit.settings.pao.hand, fit.device)
-        )
+        fit.data.replace_masks(hand_masks(fit.data, fit.settings.pao.hand, fit.device))
 
 
 class HiddenSkin(Component):
@@ -137,21 +131,21 @@ def hidden_skin(places: Sequence[np.ndarray], masks: np.ndarray) -> np.ndarray:
     return hidden
 
 
-def hand_masks(
-    training: TrainingCapture, frames: TrainingFrames, source: str, device: torch.device
-) -> torch.Tensor:
+def hand_masks(data: FitData, source: str, device: torch.device) -> torch.Tensor:
     """Return y_h of R frames, that of each frame found once.
 
     Returns:
         (R, H, W) uint8, 255 = hand. A frame in which no hand is found keeps its estimated mask:
         nothing in it could be learnt otherwise.
     """
+    frames = data.frames
     images = frames.images.numpy()
     found: Iterator[np.ndarray]
     if source == "graph-cut":
-        found = graph_cut_hands(list(images), list(_silhouettes(training, frames)))
+        # From where the posed hands would be seen if nothing covered them.
+        found = graph_cut_hands(list(images), [places > 0 for places in data.places])
     else:
-        found = _prompted(images, hand_roots(training, frames.indices), source, device)
+        found = _prompted(images, hand_roots(data.training, frames.indices), source, device)
     masks = frames.masks.clone()
     for row, mask in enumerate(track(found, "Finding hands", len(frames))):
         if mask.any():
@@ -169,9 +163,15 @@ def hand_roots(training: TrainingCapture, frames: np.ndarray) -> np.ndarray:
         (R, hands, 2) px, the centre of the top left pixel at 0.5; NaN behind the camera.
     """
     roots = []
-    for _, joints, depth in _projected(training, frames):
-        roots.append(np.where(depth[..., None] > 0.0, joints, np.nan))
-    return np.concatenate(roots)
+    for side in training.sides:
+        hand, template = training.hands[side], training.template(side).to_torch()
+        given = (hand.pose[frames], hand.betas, hand.transl[frames])
+        roots.append(pose_hand(template, *map(_real, given)).joints[:, 0])
+    cameras = training.cameras
+    places, depth = project(
+        torch.stack(roots, dim=1), _real(cameras.viewmats[frames]), _real(cameras.Ks[frames])
+    )
+    return np.where(depth.numpy()[..., None] > 0.0, places.numpy(), np.nan)
 
 
 def _prompted(
@@ -182,40 +182,6 @@ def _prompted(
         prompt = PromptedHand(sam, tuple((x, y) for x, y in places))
         yield mask_of(cache.regions(image, prompt))
     cache.prune()
-
-
-def _silhouettes(training: TrainingCapture, frames: TrainingFrames) -> Iterator[np.ndarray]:
-    """(H, W) bool for each frame, where the posed hands would be seen if nothing covered them."""
-    faces, start = [], 0
-    for template in _templates(training).values():
-        faces.append(template.faces + start)
-        start += len(template.vertices)
-    joined = np.concatenate(faces)
-    for vertices, _, _ in _projected(training, frames.indices):
-        for places, depth in vertices:
-            yield draw_faces(places, depth, joined, (training.height, training.width))[0] >= 0
-
-
-def _projected(
-    training: TrainingCapture, frames: np.ndarray
-) -> Iterator[tuple[list[tuple[np.ndarray, np.ndarray]], np.ndarray, np.ndarray]]:
-    """For some frames at a time: vertices (px, depth) of each, and the roots (px, depth)."""
-    templates = {side: t.to_torch() for side, t in _templates(training).items()}
-    for start in range(0, len(frames), _CHUNK):
-        part = frames[start : start + _CHUNK]
-        posed = [
-            pose_hand(template, _real(hand.pose[part]), _real(hand.betas), _real(hand.transl[part]))
-            for hand, template in ((training.hands[side], templates[side]) for side in templates)
-        ]
-        cameras = _real(training.cameras.viewmats[part]), _real(training.cameras.Ks[part])
-        places, depth = project(torch.cat([hand.vertices for hand in posed], dim=1), *cameras)
-        roots, away = project(torch.stack([hand.joints[:, 0] for hand in posed], dim=1), *cameras)
-        vertices = list(zip(places.numpy(), depth.numpy(), strict=True))
-        yield vertices, roots.numpy(), away.numpy()
-
-
-def _templates(training: TrainingCapture) -> Mapping[str, HandTemplate]:
-    return {side: training.template(side) for side in training.sides}
 
 
 def _real(array: np.ndarray) -> torch.Tensor:

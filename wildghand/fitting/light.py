@@ -8,31 +8,25 @@ from __future__ import annotations
 
 import itertools
 import time
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from hwp_bench.base.colors import srgb_to_linear
 from hwp_bench.hands import pose_hand
-from wildghand.evidence.count import read_images, seen_anchors
+from wildghand.evidence.count import facing_of, read_images, seen_anchors
 from wildghand.fitting.fit import Batch, Component, DrawOptions, Fit
 from wildghand.gaussians.quaternions import quat_third_axis
-from wildghand.gaussians.rig import HandRig
-from wildghand.gaussians.training import TrainingClip
 from wildghand.light import (
     KnownLight,
     LightSamples,
-    Obstacles,
-    ShadowSamples,
     ShadowTable,
     find_light,
     fit_light,
     obstacles_in_frames,
 )
-from wildghand.model.frames import camera_centres
-from wildghand.model.model import WildGHandModel
 
 # Weight of a frame from which it is read, if at least so many frames have it.
 _GOOD, _LEAST = 0.5, 4
@@ -41,19 +35,27 @@ _FACING, _VISIBLE = 0.35, 0.05
 # Cosine between normal and viewing direction from which a place is seen, and from which its colour
 # counts: at a grazing angle pixels are mixed with what is behind.
 _SEEN, _COUNTED = 0.02, 0.25
+#: Frames that are read at most for the light that casts shadows, spread over the clip, and places
+#: on each hand: rays to all candidate lamps take a second.
+FRAMES, PLACES = 96, 400
+#: Samples from which the light beyond the normals is fitted, at most: more change nothing, and take
+#: time.
+SAMPLES = 40_000
 #: Frames that are predicted at a time.
 CHUNK = 16
 
 
-class Shadows(Component):
-    """The hands cast shadows on themselves and on each other, under a light that frames tell."""
+class Lighting(Component):
+    """Hands cast shadows under a light that frames tell (`shadows`), and normals that no frame has
+    shown are drawn by a light that is fitted to the others (`light`).
+    """
 
     def __init__(self) -> None:
         self._table: ShadowTable | None = None
 
     def before(self, fit: Fit) -> None:
-        """Find the light, and let the model keep it; none where too little of a hand is seen."""
-        light = find_light(shadow_samples(fit), fit.settings.shadows)
+        """Let the model keep the light of the shadows; none where too little of a hand is seen."""
+        light = find_light(shadow_samples(fit)) if fit.settings.shadows.enabled else None
         if light is not None:
             fit.model.keep(light)
             assert fit.model.shadows is not None
@@ -71,89 +73,77 @@ class Shadows(Component):
         """The shadows in the frames of a batch."""
         return {"dark": self.dark(batch.mine)}
 
-
-class UnseenLight(Component):
-    """Normals that no frame has shown are drawn by a light that is fitted to the others."""
-
     def after(self, fit: Fit) -> None:
-        """Fit the light; none where too little of it is seen."""
-        found = learn_light(fit)
+        """Fit the light of unknown normals; none where too little of it is seen."""
+        found = learn_light(fit) if fit.settings.light.enabled else None
         if found is not None:
             fit.model.keep(found)
 
     def seconds(self, fit: Fit) -> float:
         """The light of a few frames is fitted to see how long that takes."""
-        _timed(fit, 1)  # The first time takes longer than others.
+        if not fit.settings.light.enabled:
+            return 0.0
+
+        def timed(frames: int) -> float:
+            entered = time.perf_counter()
+            learn_light(fit, frames)
+            return time.perf_counter() - entered
+
+        timed(1)  # The first time takes longer than others.
         count = len(fit.data.frames)
-        one, many = _timed(fit, 1), min(count, CHUNK)
-        each = max(0.0, _timed(fit, many) - one) / max(1, many - 1)
+        one, many = timed(1), min(count, CHUNK)
+        each = max(0.0, timed(many) - one) / max(1, many - 1)
         return one + each * (count - 1)
 
 
 def learn_light(fit: Fit, frames: int | None = None) -> KnownLight | None:
     """Fit a light to what a model says of the clip; None where too little of it is seen."""
-    weights, settings = fit.data.judgement.frame_weights, fit.settings.light
-    count = len(weights)
+    count = len(fit.data.frames)
     read = count if frames is None else frames
-    samples = light_samples(
-        fit.model, fit.clip, weights[:read], settings.samples * read // count, fit.seed
-    )
-    return fit_light(samples)
-
-
-def _timed(fit: Fit, frames: int) -> float:
-    entered = time.perf_counter()
-    learn_light(fit, frames)
-    return time.perf_counter() - entered
+    return fit_light(light_samples(fit, read, SAMPLES * read // count))
 
 
 @torch.no_grad()
-def light_samples(
-    model: WildGHandModel, clip: TrainingClip, frame_weights: Tensor, count: int, seed: int
-) -> LightSamples:
-    """Read the colours that a model gives to visible places in the training frames.
-
-    Args:
-        frame_weights: (R,) how much each frame counts.
-    """
-    generator = torch.Generator().manual_seed(seed)
-    rows = torch.arange(len(frame_weights))
+def light_samples(fit: Fit, frames: int, count: int) -> LightSamples:
+    """About so many colours that a model gives to visible places in the first frames."""
+    model, clip, frame_weights = fit.model, fit.clip, fit.data.judgement.frame_weights
+    generator = torch.Generator().manual_seed(fit.seed)
+    rows = torch.arange(frames)
     whole = sum(len(rig) for rig in model.rigs.values()) * len(rows)
     share = min(1.0, 2.0 * count / max(whole, 1))  # about half of the skin faces away
-    places, normals, light, weights = [], [], [], []
+    found = []
     first = 0
     for side, rig in model.rigs.items():
-        for start in range(0, len(rows), CHUNK):
-            part = rows[start : start + CHUNK].to(clip.viewmats.device)
-            anchors = clip.hand(side, part)
-            prediction = model.predict(side, anchors, clip.parameters[side][0][part])
-            turned = quat_third_axis(anchors.orientations)
-            away = camera_centres(clip.viewmats[part])[:, None] - anchors.positions
-            facing = (normalize(away, dim=-1) * turned).sum(dim=-1).cpu()
+        for part in rows.split(CHUNK):
+            here = part.to(clip.viewmats.device)
+            anchors = clip.hand(side, here)
+            prediction = model.predict(side, anchors, clip.parameters[side][0][here])
+            facing = facing_of(anchors, clip.viewmats[here]).cpu()
             chosen = (facing > _SEEN) & (torch.rand(facing.shape, generator=generator) < share)
             frame, place = chosen.nonzero(as_tuple=True)
             colors = prediction.raw.logit_colors.sigmoid() * prediction.shadow
             colors = colors.expand(*facing.shape, 3).cpu()[frame, place]
             counted = torch.where(facing > _COUNTED, facing, 0.0)[frame, place]
-            places.append(place.numpy() + first)
-            normals.append(turned.cpu()[frame, place].double().numpy())
-            light.append(srgb_to_linear(colors.double().numpy()).mean(axis=1))
-            weights.append((counted * frame_weights[start + frame]).double().numpy())
+            normals = quat_third_axis(anchors.orientations).cpu()[frame, place]
+            found.append(
+                (
+                    place.numpy() + first,
+                    normals.double().numpy(),
+                    srgb_to_linear(colors.double().numpy()).mean(axis=1),
+                    (counted * frame_weights[part[frame]]).double().numpy(),
+                )
+            )
         first += len(rig)
-    return LightSamples(
-        np.concatenate(places),
-        np.concatenate(normals),
-        np.concatenate(light),
-        np.concatenate(weights),
-    )
+    numbers, turned, light, weights = _joined(found)
+    return LightSamples(numbers, turned, light, weights)
 
 
 @torch.no_grad()
-def shadow_samples(fit: Fit) -> ShadowSamples:
+def shadow_samples(fit: Fit) -> LightSamples:
     """Read the colours of places in the frames that the pre-pass weighs most."""
-    data, settings, rigs, clip = fit.data, fit.settings.shadows, fit.model.rigs, fit.clip
+    data, rigs, clip = fit.data, fit.model.rigs, fit.clip
     judgement = data.judgement
-    rows = best_of_each_part(judgement.frame_weights, settings.frames)
+    rows = best_of_each_part(judgement.frame_weights, FRAMES)
     good = judgement.frame_weights[rows] > _GOOD
     rows = rows[good] if int(good.sum()) >= _LEAST else rows
     here = rows.to(clip.viewmats.device)
@@ -161,11 +151,12 @@ def shadow_samples(fit: Fit) -> ShadowSamples:
     hands = {side: clip.hand(side, here) for side in rigs}
     seen = seen_anchors(hands, clip.viewmats[here], clip.Ks[here], says.shape[1:])
     images = data.frames.images[rows].to(here.device)
+    gains = judgement.gains[rows].numpy()
     generator = np.random.default_rng(fit.seed)
     found: list[tuple[np.ndarray, ...]] = []
     first = 0
     for side, rig in rigs.items():
-        chosen = generator.permutation(len(rig))[: settings.places]
+        chosen = generator.permutation(len(rig))[:PLACES]
         pixels, facing = (part[:, chosen] for part in seen[side])
         weights = (read_images(says, pixels) * facing).cpu().numpy()
         weights[facing.cpu().numpy() <= _FACING] = 0.0
@@ -174,7 +165,6 @@ def shadow_samples(fit: Fit) -> ShadowSamples:
         light = srgb_to_linear(np.stack(colors, axis=-1)[frame, place] / 255.0).mean(axis=-1)
         normals = quat_third_axis(hands[side].orientations[:, chosen]).cpu().numpy()
         points = hands[side].positions[:, chosen].cpu().numpy()
-        gains = judgement.gains[rows].numpy()
         found.append(
             (
                 first + chosen[place],
@@ -186,30 +176,35 @@ def shadow_samples(fit: Fit) -> ShadowSamples:
             )
         )
         first += len(rig)
-    places, normals, light, weights, points, frame = (
-        np.concatenate(column) for column in zip(*found, strict=True)
-    )
-    obstacles = _obstacles(rigs, clip, here)
+    places, normals, light, weights, points, frame = _joined(found)
+    free = _free(fit, here, points, normals, frame)
+    return LightSamples(places, normals, light, weights, free)
+
+
+def _joined(columns: Sequence[tuple[np.ndarray, ...]]) -> list[np.ndarray]:
+    return [np.concatenate(column) for column in zip(*columns, strict=True)]
+
+
+def _free(
+    fit: Fit, rows: Tensor, points: np.ndarray, normals: np.ndarray, frame: np.ndarray
+) -> Callable[[np.ndarray], np.ndarray]:
+    """Of (M, 3) points in some of the frames: from directions to which of them is free."""
+    surfaces = []
+    for side, rig in fit.model.rigs.items():
+        pose, betas, transl = fit.clip.parameters[side]
+        vertices = pose_hand(rig.template, pose[rows], betas, transl[rows]).vertices
+        surfaces.append((vertices.cpu().numpy(), rig.template.faces.cpu().numpy()))
+    obstacles = list(obstacles_in_frames(surfaces))
 
     def free(directions: np.ndarray) -> np.ndarray:
-        open_ = np.ones((len(places), len(directions)))
+        open_ = np.ones((len(points), len(directions)))
         for number, in_the_way in enumerate(obstacles):
             mine = np.flatnonzero(frame == number)
             if len(mine):
                 open_[mine] = in_the_way.free(points[mine], normals[mine], directions)
         return open_
 
-    return ShadowSamples(places, normals, light, weights, free)
-
-
-def _obstacles(rigs: dict[str, HandRig], clip: TrainingClip, rows: Tensor) -> list[Obstacles]:
-    """The posed hands of each of some frames."""
-    surfaces = []
-    for side, rig in rigs.items():
-        pose, betas, transl = clip.parameters[side]
-        vertices = pose_hand(rig.template, pose[rows], betas, transl[rows]).vertices
-        surfaces.append((vertices.cpu().numpy(), rig.template.faces.cpu().numpy()))
-    return list(obstacles_in_frames(surfaces))
+    return free
 
 
 def best_of_each_part(weights: Tensor, count: int) -> Tensor:

@@ -16,6 +16,7 @@ from wildghand.fitting.descent import Features
 from wildghand.fitting.fit import Batch, Component, Fit, FrameTarget
 from wildghand.gaussians.perceptual import FilterBankLoss, Vgg19
 from wildghand.gaussians.regularizers import attribute_roughness, off_surface, surface_laplacian
+from wildghand.gaussians.training import upload
 from wildghand.model import terms
 from wildghand.model.frames import RenderedFrames
 from wildghand.model.settings import WildGHandSettings
@@ -42,7 +43,8 @@ class Reconstruction(Component):
             found = self._perceptual(image, target.image, target.weights)
             yield settings.perceptual * found
         if weights.silhouette:
-            yield weights.silhouette * terms.silhouette(drawing.coverage, target.hand)
+            hands = fit.data.silhouettes(batch.mine)
+            yield weights.silhouette * terms.silhouette(drawing.coverage, hands)
 
 
 class Regularisers(Component):
@@ -68,11 +70,19 @@ class Regularisers(Component):
         for side, hand in drawing.hands.items():
             raw = hand.prediction.raw
             if weights.bias and hand.bias_size is not None:
-                yield weights.bias * hand.bias_size
-            if weights.shadow:
-                yield weights.shadow * terms.distance_to_one(hand.prediction.shadow)
-            if weights.opacity:
-                yield weights.opacity * terms.distance_to_one(hand.opacities)
+                size = hand.bias_size
+                if weights.squared_sums:
+                    module = model.biases_of(side)
+                    z = module.temporal(upload(batch.mine, fit.device)).z
+                    size = module.sum_of_means(raw.concatenate(), z).square().mean()
+                yield weights.bias * size
+            for weight, values in (
+                (weights.shadow, hand.prediction.shadow),
+                (weights.opacity, hand.opacities),
+            ):
+                if weight:
+                    distance = terms.distance_to_one(values, squared=weights.squared_distances)
+                    yield weight * distance
             if settings.surface:
                 off = off_surface(
                     raw,
@@ -94,7 +104,8 @@ class Regularisers(Component):
                 found.append(weights.laplacian_offsets * rough)
         if weights.cross_hand and len(features) == 2:
             left, right = (features[side].texture for side in ("left", "right"))
-            found.append(weights.cross_hand * terms.cross_hand(left, right))
+            apart = terms.cross_hand(left, right, squared=weights.squared_sums)
+            found.append(weights.cross_hand * apart)
         return torch.stack(found).sum() if found else None
 
 

@@ -33,7 +33,7 @@ from wildghand.fitting.fit import Fit
 from wildghand.fitting.method import affordable, ready_fit
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
 from wildghand.gaussians.fit_loop import Loss
-from wildghand.model.settings import WildGHandSettings, read_settings
+from wildghand.model.settings import read_settings
 from wildghand.plain.loop import IterativeFit, Watchers, run_fit
 from wildghand.splat.threads import denormals_flushed
 
@@ -115,36 +115,31 @@ def fit_capture(
     chosen = read_settings(settings or {})
     world.shard(chosen.schedule.batch)
     run = RunSettings(dict(settings or {}), seed, budget or Budget())
-    if out is None:
-        if world.size > 1:
-            raise UsageError("is missing; several processes share a fit in its folder", field="out")
-        capture = open_capture(source)
-        split = every_frame(capture) if all_frames else _split(capture)
-        with tempfile.TemporaryDirectory() as folder:
-            write_request(Path(folder) / "request", capture, split, run)
-            avatar = _fit_in(Path(folder), capture, run, chosen, world, watch, save=False)
-            _ = avatar.weight_masks  # Made while the frames are there.
-            return avatar
-    out = Path(out)
-    if out.exists() and not overwrite and not (out / CALL).is_file():
-        raise _exists(out)
+    if out is None and world.size > 1:
+        raise UsageError("is missing; several processes share a fit in its folder", field="out")
+    exists = UsageError("exists", where=out, remedy="Choose another name, or give --overwrite.")
+    kept = out is not None and Path(out).exists() and not overwrite
+    if out is not None and kept and not (Path(out) / CALL).is_file():
+        raise exists
     capture = open_capture(source)
     split = every_frame(capture) if all_frames else _split(capture)
-    work = unfinished(out)
+    if out is None:
+        with tempfile.TemporaryDirectory() as folder:
+            avatar = _fit_in(Path(folder), capture, split, run, world, watch, save=False)
+            _ = avatar.weight_masks  # Made while the frames are there.
+            return avatar
+    out, work = Path(out), unfinished(Path(out))
     limits = [run.budget.seconds, run.budget.steps]
     call = sha256_json([capture.digest, split.digest, dict(run.settings), seed, limits])
-    if out.exists() and not overwrite:
+    if kept:
         if not made_by_call(out, call):
-            raise _exists(out)
+            raise exists
         # A process may be killed after its avatar was whole.
         if world.is_main:
             notice(f"{out} is complete: the same call has made it; --overwrite fits again")
         return load_avatar(out)
     with disc_errors(work), exclusive(work) if world.is_main else contextlib.nullcontext():
-        if world.is_main:
-            write_request(work / "request", capture, split, run)
-        world.wait_for_main()
-        avatar = _fit_in(work, capture, run, chosen, world, watch)
+        avatar = _fit_in(work, capture, split, run, world, watch)
         if world.is_main:
             save_avatar(avatar, out, overwrite=overwrite, call=call)
             shutil.rmtree(work, ignore_errors=True)
@@ -152,25 +147,23 @@ def fit_capture(
     return avatar
 
 
-def _exists(out: Path) -> UsageError:
-    return UsageError("exists", where=out, remedy="Choose another name, or give --overwrite.")
-
-
 def _fit_in(
     work: Path,
     capture: Capture,
+    split: Split,
     run: RunSettings,
-    chosen: WildGHandSettings,
     world: World,
     watch: Watch | None,
     *,
     save: bool = True,
 ) -> WildGHandAvatar:
     """Fit, from the state that is saved in the work folder if there is one."""
+    if world.is_main:
+        write_request(work / "request", capture, split, run)
+    world.wait_for_main()
+    chosen = read_settings(run.settings)
     training = affordable(open_request(work / "request"), chosen, run.budget)
-    digest = sha256_json(
-        [sha256_file(work / "request" / REQUEST), capture.info.to_json().get("digests")]
-    )
+    digest = digest_of_request(work / "request", capture)
     entered = time.perf_counter()
     device = ready_fit(chosen.device)
     if world.is_main:
@@ -193,6 +186,11 @@ def _fit_in(
         begin=fit.require_same,
         look=look,
     )
+
+
+def digest_of_request(request: Path, capture: Capture) -> str:
+    """What a saved state belongs to: the request, and what the capture's files held."""
+    return sha256_json([sha256_file(request / REQUEST), capture.info.to_json().get("digests")])
 
 
 def run_resumed(

@@ -11,7 +11,7 @@ from wildghand.fitting.fit import Component, Fit
 from wildghand.gaussians.training import TrainingFrames
 from wildghand.poses import ClipPoses, believed_hands
 from wildghand.prior.prior import choose_prior
-from wildghand.subject import SubjectSettings, SubjectShape, fit_subject
+from wildghand.subject import SubjectShape, fit_subject
 from wildghand.subject.outlines import ComparedFrames
 
 
@@ -26,7 +26,7 @@ class Poses(Component):
     def prepare(self, fit: Fit) -> None:
         """Put the capture with corrected hands in place of the given one."""
         training, templates = fit.data.training, fit.data.templates
-        believed = believed_hands(templates, training.hands, training.cameras, fit.settings.poses)
+        believed = believed_hands(templates, training.hands, training.cameras)
         self.remembered = ClipPoses.of(training.hands, believed)
         if self.remembered is not None:
             fit.data.training = training.with_hands(believed)
@@ -45,13 +45,10 @@ class Person(Component):
 
     def prepare(self, fit: Fit) -> None:
         """Find how the person's hand differs from the templates."""
-        data, settings = fit.data, fit.settings.subject
-        data.subject = find_person(data, settings, data.judges if settings.validated else None)
+        fit.data.subject = find_person(fit.data, fit.data.judges)
 
 
-def find_person(
-    data: FitData, settings: SubjectSettings, judges: TrainingFrames | None
-) -> SubjectShape | None:
+def find_person(data: FitData, judges: TrainingFrames | None) -> SubjectShape:
     """How a person's hand differs from the templates, chosen by `judges` where there are any."""
     training, frames = data.training, data.frames
 
@@ -65,7 +62,6 @@ def find_person(
         training.cameras,
         frames.indices,
         np.asarray(frames.masks),
-        settings,
         judges=None if judges is None else compared(judges),
     )
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
@@ -11,7 +10,6 @@ import torch
 from torch import Tensor
 
 from hwp_bench.methods.settings import source_path
-from wildghand.dpd.temporal import PayBack
 from wildghand.fitting.fit import Batch, Component, DrawOptions, Fit, FrameTarget
 from wildghand.fitting.judging import Prepass
 from wildghand.fitting.parallel import SINGLE_PROCESS
@@ -33,7 +31,7 @@ class MaskWeights(Component):
 
         def weigh(rows: Tensor) -> Tensor:
             if settings.pao.enabled:
-                return binary_weights(masks(rows), settings.pao.binary_outside)
+                return binary_weights(masks(rows))
             return soft_weights(masks(rows), settings.terms.outside_weight)
 
         frames = fit.data.frames
@@ -59,7 +57,6 @@ class Pao(Component):
             those of regions, and how much a frame teaches.
         lifts: (R,) in [0, 1], how far the weights of each frame's regions are lifted: by the
             tolerance, and by the probability that the frame is clean.
-        pay_back: what the frames' biases explain; None where nothing follows from it.
     """
 
     weights: PerturbationAwareWeights
@@ -67,28 +64,26 @@ class Pao(Component):
     def before(self, fit: Fit) -> None:
         """Cut the frames into regions."""
         data, settings, device = fit.data, fit.settings, fit.device
-        pao, count = settings.pao, len(data.frames)
-        self.weights = PerturbationAwareWeights(pao, len(data.training.sides)).to(device)
+        pao, count, clean = settings.pao, len(data.frames), data.judgement.clean
+        self.weights = PerturbationAwareWeights(pao.variant, len(data.training.sides)).to(device)
+        self._scaled = pao.variant == "scaled"
         self.median: float | Tensor | None = None
         self.tolerance, self.lifts = 0.0, torch.zeros(count)
-        by_place, clean = pao.errors == "place", data.judgement.clean
         prepass = fit.part(Prepass)
-        if prepass is not None and by_place and pao.variant == "scaled":
+        if prepass is not None and self._scaled:
             floor = settings.prepass.misplacement_floor
             shared = pao.mismatch * prepass.assessment.shared_mismatch(floor)
             self.tolerance = shared**2 / (1.0 + shared**2)
             spared = clean if pao.spare_clean else torch.zeros_like(clean)
             self.lifts = 1.0 - (1.0 - self.tolerance) * (1.0 - spared)
         # Without DPD there is no omega.
-        self._teaches = pao.temporal == "teaching" and settings.dpd.enabled
-        tolerance = settings.dpd.pay_back if self._teaches else 0.0
-        self.pay_back = PayBack(clean.to(device), tolerance) if tolerance else None
+        self._teaches = self._scaled and settings.dpd.enabled
         regions = RegionCache().clip(
             data.frames.images.numpy(), choose_segmenter(pao.regions, device)
         )
         self._regions = ClipRegions(regions, device)
         self.places: PlaceErrors | None = None
-        if by_place:
+        if self._scaled:
             labels = [FrameRegions(one) for one in data.places]
             numbers = 1 + max(int(one.max()) for one in data.places)
             self.places = PlaceErrors(ClipRegions(labels, device), clean.to(device), numbers)
@@ -99,61 +94,65 @@ class Pao(Component):
 
     def draws(self, fit: Fit, batch: Batch) -> DrawOptions:
         """The canonical hand learns the less from a frame, the more it is perturbed."""
-        return {"teach": functools.partial(self.shares, batch.mine)} if self._teaches else {}
+        return {"teach": self.shares} if self._teaches else {}
 
-    def shares(self, rows: Tensor, omega: Tensor) -> Tensor:
-        """How much the canonical hand learns from each frame of a batch.
+    def shares(self, omega: Tensor) -> Tensor:
+        """How much the canonical hand learns from frames, (B,) in (0, 1].
 
         Args:
-            rows: (B,) int64, which of the R frames; on the CPU.
             omega: (B,) their temporal weights, without gradient.
-
-        Returns:
-            (B,) in (0, 1].
         """
         shares = self.weights.temporal_factor(omega)
-        shares = shares + self.tolerance * (1.0 - shares)
-        if self.pay_back is not None:
-            shares = torch.maximum(shares, self.pay_back.shares(rows))
-        return shares
+        return shares + self.tolerance * (1.0 - shares)
 
     def compare(
         self, fit: Fit, batch: Batch, drawing: RenderedFrames, target: FrameTarget
     ) -> FrameTarget:
         """Weigh by the paper's equations.
 
-        They compare the frames of a batch, so that all processes weigh all of it.
+        The default compares the frames of a batch, so that all processes weigh all of it.
         """
-        data, settings = fit.data, fit.settings
+        if self.weights.variant == "released":
+            return self._compare_as_released(fit, batch, drawing, target)
+        data = fit.data
         # Frames are looked at by one process alone.
         world = fit.world if batch.stepping else SINGLE_PROCESS
         rows, mine, hands = batch.rows, batch.mine, data.masks(batch.rows)
         error = world.gather(_mean_error(drawing.image, target.image))
-        if self.pay_back is not None:
-            counted = soft_weights(hands, settings.terms.outside_weight)
-            uncovered = data.uncovered(rows)
-            counted = counted if uncovered is None else counted * uncovered
-            self.pay_back.watch(rows, error, counted * hands)
-        omega = world.gather(drawing.omega)
-        if world.size > 1:  # what is gathered has no gradient
-            before, after = omega[: batch.part.start], omega[batch.part.stop :]
-            omega = torch.cat([before, drawing.omega, after])
         expected = None
         if self.places is not None and self.median is not None:
             expected = self.places.expected(rows, self.median)
-        found = self.weights(error, self._regions(rows), hands, omega, self.median, expected)
-        if settings.pao.errors in ("median", "place"):
+        omega = world.gather(drawing.omega.detach())
+        found = self.weights(error, self._regions(rows), hands, omega, expected)
+        if self.places is not None:
             self.median = running_median(self.median, found.mean_errors, found.shares > 0.0)
-        if self.places is not None and self.median is not None:
             self.places.watch(rows, error, hands > 0.5, self.median)
         weights, lifts = found.weights[batch.part], self.lifts[mine]
+        sizes = weights.mean(dim=(1, 2))
         if bool((lifts > 0.0).any()):
             share = upload(lifts, fit.device)[:, None, None].to(weights)
             weights = torch.lerp(weights, target.hand.to(weights), share)
-        if settings.pao.variant == "scaled":
-            weights = weights + settings.terms.outside_weight * (1.0 - target.hand)
-        weights = weights * target.weights
-        return replace(target, weights=weights, sizes=found.sizes[batch.part])
+        if self._scaled:
+            weights = weights + fit.settings.terms.outside_weight * (1.0 - target.hand)
+        return replace(target, weights=weights * target.weights, sizes=sizes)
+
+    def _compare_as_released(
+        self, fit: Fit, batch: Batch, drawing: RenderedFrames, target: FrameTarget
+    ) -> FrameTarget:
+        """Weigh by the authors' code, each process its own frames; black is what is not hand."""
+        whole, visible = fit.data.whole_images(batch.mine), target.hand > 0.5
+        found = self.weights.released(
+            (drawing.image - whole).abs(),
+            self._regions(batch.mine),
+            visible,
+            fit.data.silhouettes(batch.mine),
+            drawing.coverage[..., 0],
+        )
+        weights = found.weights
+        image = whole * visible[..., None]
+        return replace(
+            target, image=image, weights=weights * target.weights, sizes=weights.mean(dim=(1, 2))
+        )
 
     def loss(
         self, fit: Fit, batch: Batch, drawing: RenderedFrames, target: FrameTarget
@@ -169,7 +168,6 @@ class Pao(Component):
             "thresholds": self.weights.state_dict(),
             "median": None if self.median is None else float(self.median),
             "ordinary": None if self.places is None else self.places.ordinary.clone(),
-            "residuals": None if self.pay_back is None else self.pay_back.residuals.clone(),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -178,8 +176,6 @@ class Pao(Component):
         self.median = None if state["median"] is None else float(state["median"])
         if self.places is not None:
             self.places.ordinary.copy_(state["ordinary"])
-        if self.pay_back is not None:
-            self.pay_back.residuals.copy_(state["residuals"])
 
 
 def choose_segmenter(source: str, device: torch.device) -> Segmenter:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,8 +19,7 @@ from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import DESCRIPTION, load_avatar
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
 from wildghand.fitting.session import Watch, fit_capture
-from wildghand.from_video.job import Job, VideoFit, with_quick
-from wildghand.from_video.run import JobRecord, Stage, run_stages
+from wildghand.from_video.run import Job, JobRecord, VideoFit, run_stages, with_quick
 from wildghand.from_video.stages import STAGES
 from wildghand.model.settings import read_settings
 
@@ -83,7 +82,6 @@ def make_avatar(
     *,
     overwrite: bool = False,
     world: World = SINGLE_PROCESS,
-    stages: Sequence[Stage] = STAGES,
     watch: Watch | None = None,
 ) -> MadeAvatar:
     """Make an avatar of the hand in a video, with a clip and a sheet to look at.
@@ -98,7 +96,6 @@ def make_avatar(
         options: choices; the defaults where None.
         overwrite: make everything again; replace an avatar that came from elsewhere.
         world: the processes that fit together.
-        stages: what is run.
         watch: who is shown the fit while it runs.
 
     Raises:
@@ -121,7 +118,7 @@ def make_avatar(
     with exclusive(job.work) if world.is_main else contextlib.nullcontext():
         if overwrite and world.is_main:
             job.record.unlink(missing_ok=True)
-        record, kept = run_stages(job, stages)
+        record, kept = run_stages(job, STAGES)
     return MadeAvatar(load_avatar(folder, hand=options.hand_model), job, record, tuple(kept))
 
 

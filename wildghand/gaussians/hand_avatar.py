@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 import torch
@@ -90,3 +90,23 @@ class HandAvatar:
 
     def _tensor(self, array: np.ndarray) -> torch.Tensor:
         return torch.as_tensor(np.asarray(array), dtype=torch.float32, device=self._device)
+
+
+class DrawnAvatar(HandAvatar):
+    """An avatar that a function draws; see `HandAvatar`.
+
+    Args:
+        draw: as `HandAvatar.draw`; while a fit goes on it may draw the live model.
+    """
+
+    def __init__(
+        self,
+        draw: Callable[
+            [PosedHands, torch.Tensor, torch.Tensor, int, int], tuple[torch.Tensor, torch.Tensor]
+        ],
+        sides: Iterable[str],
+        device: torch.device,
+        steps: int,
+    ) -> None:
+        super().__init__(sides, device, steps)
+        self.draw = draw  # type: ignore[method-assign]

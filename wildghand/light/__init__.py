@@ -1,24 +1,14 @@
 """Light: beyond what a clip shows, and where hands keep it from themselves and from each other."""
 
-from wildghand.light.fit_lights import (
-    KnownLight,
-    LightSamples,
-    ShadowSamples,
-    find_light,
-    fit_light,
-)
 from wildghand.light.hand_shadows import HandShadows, Obstacles, ShadowTable, obstacles_in_frames
-from wildghand.light.lights import CastLight, LightSettings, ShadowSettings
+from wildghand.light.light import CastLight, KnownLight, LightSamples, find_light, fit_light
 
 __all__ = [
     "CastLight",
     "HandShadows",
     "KnownLight",
     "LightSamples",
-    "LightSettings",
     "Obstacles",
-    "ShadowSamples",
-    "ShadowSettings",
     "ShadowTable",
     "find_light",
     "fit_light",

@@ -13,7 +13,7 @@ from hwp_bench.base.rays import ray_mesh
 from hwp_bench.hands import TemplateTensors, pose_hand, vertex_normals
 from wildghand.gaussians.rig import HandRig
 from wildghand.gaussians.training import TrainingClip, upload
-from wildghand.light.lights import DARKEST, SRGB, CastLight, ShadowSettings
+from wildghand.light.light import DARKEST, SRGB, CastLight
 
 #: How far a ray starts from the skin, m: the surface of an estimated hand is not exact, and a
 #: fold must not shade itself.
@@ -89,7 +89,6 @@ class HandShadows:
     Args:
         rigs: by side; the light of each is kept off by all that are posed with it.
         light: under which they stand.
-        settings: how hands are drawn in it.
         darkest: share of the light that is left in the darkest shadow.
     """
 
@@ -97,11 +96,10 @@ class HandShadows:
         self,
         rigs: Mapping[str, HandRig],
         light: CastLight,
-        settings: ShadowSettings,
         *,
         darkest: float = DARKEST,
     ) -> None:
-        self._settings, self._darkest = settings, darkest
+        self._darkest = darkest
         self._templates = {side: _on_cpu(rig.template) for side, rig in rigs.items()}
         self._faces = {side: made.faces.numpy() for side, made in self._templates.items()}
         self._light = light.lit()
@@ -117,8 +115,8 @@ class HandShadows:
             )
 
     @torch.no_grad()
-    def shading(self, normals: Tensor) -> Tensor | None:
-        """Factors on the sRGB colours of skin with nothing in the way; None: ones.
+    def shading(self, normals: Tensor) -> Tensor:
+        """Factors on the sRGB colours of skin with nothing in the way.
 
         Args:
             normals: (B, N, 3) of length 1.
@@ -126,8 +124,6 @@ class HandShadows:
         Returns:
             (B, N), 1 at the mean irradiance of what the light was found in.
         """
-        if not self._settings.shading:
-            return None
         # In float64, frame by frame: rounded, a frame has the same bits in every batch.
         falling = torch.stack(
             [

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
+from wildghand.evidence.count import facing_of
 from wildghand.gaussians.attributes import RawAttributes
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import AnchorPoses
@@ -116,17 +116,11 @@ def relit(
         viewmats: (B, 4, 4) of the cameras. Skin that does not face them stays as it is.
     """
     normals = quat_third_axis(anchors.orientations)
-    away = normalize(camera_centres(viewmats)[:, None] - anchors.positions, dim=-1)
-    share = light.unknown(normals, (away * normals).sum(dim=-1))
+    share = light.unknown(normals, facing_of(anchors, viewmats))
     if not bool((share > 0.0).any()):
         return prediction
     known = light.nearest_known(normals)
     return carried_on(prediction, network(known), light.ratio(normals, known), share)
-
-
-def camera_centres(viewmats: Tensor) -> Tensor:
-    """(B, 3) world places of the cameras of (B, 4, 4) world to camera."""
-    return -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:])[..., 0]
 
 
 def carried_on(

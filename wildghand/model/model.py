@@ -18,11 +18,12 @@ from hwp_bench.hands import HandTemplate, sample_surface
 from wildghand.dpd.dpd import DynamicPerturbation, Perturbation, Temporal, bone_features
 from wildghand.dpd.temporal import scale_refinement
 from wildghand.evidence import ColorChanges, Evidence
+from wildghand.gaussians.attributes import RawAttributes
 from wildghand.gaussians.found import Found
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import AnchorPoses, HandRig, rig_of
 from wildghand.gaussians.training import TrainingClip
-from wildghand.light import CastLight, HandShadows, KnownLight, ShadowSettings
+from wildghand.light import CastLight, HandShadows, KnownLight
 from wildghand.light.hand_shadows import Hand, Hands
 from wildghand.model.dress import Gaussians, dress
 from wildghand.model.frames import HandState, RenderedFrames, largest, rasterize_hands, relit
@@ -71,8 +72,8 @@ class WildGHandModel(nn.Module):
         dpd: model perturbations as biases of the attributes.
         embedding: width of the temporal embedding.
         rank: of the field of biases; 0: none.
+        poses: the frames' poses are corrected by their temporal embedding.
         template: apply the network's displacement of the template (head iii).
-        shadows: how hands are drawn in the light that casts shadows, once there is one.
 
     Attributes:
         log_gains: (R, 3) log of the gain on the sRGB image of each frame.
@@ -95,11 +96,10 @@ class WildGHandModel(nn.Module):
         dpd: bool = True,
         embedding: int = 256,
         rank: int = 0,
+        poses: bool = False,
         template: bool = True,
-        shadows: ShadowSettings | None = None,
     ) -> None:
         super().__init__()
-        self._shadow_settings = shadows or ShadowSettings()
         self.shadows: HandShadows | None = None
         self._template = template
         self.light: KnownLight | None = None
@@ -109,8 +109,9 @@ class WildGHandModel(nn.Module):
         self._walls: dict[str, WristWall] = {}
         self.rigs = dict(rigs)
         self.network = network
+        bounds = (network.settings.max_pose, network.settings.max_transl) if poses else None
         self.perturbation = nn.ModuleDict(
-            {side: DynamicPerturbation(frame_count, embedding, rank) for side in rigs}
+            {side: DynamicPerturbation(frame_count, embedding, rank, bounds) for side in rigs}
             if dpd
             else {}
         )
@@ -127,7 +128,7 @@ class WildGHandModel(nn.Module):
             self.register_buffer(name, values.to(device))
         held: Any = found.to(device)
         if isinstance(held, CastLight):
-            held = HandShadows(self.rigs, held, self._shadow_settings)
+            held = HandShadows(self.rigs, held)
         if isinstance(held, Evidence):
             walls = {side: WristWall.of(rig) for side, rig in self.rigs.items()}
             self._walls = {side: wall for side, wall in walls.items() if wall is not None}
@@ -176,6 +177,7 @@ class WildGHandModel(nn.Module):
         refine: bool = False,
         features: Mapping[str, HandFeatures] | None = None,
         dark: Mapping[str, Tensor] | None = None,
+        plain: Tensor | None = None,
     ) -> RenderedFrames:
         """Draw training frames with everything that is particular to them.
 
@@ -186,12 +188,20 @@ class WildGHandModel(nn.Module):
             teach: from (B,) temporal weights, before dropout and without gradient, to how much the
                 canonical hand learns from each frame, (B,) in [0, 1], or None: all. None: all.
             dark: (B, N) factors of the hands' shadows by side, where they are at hand already.
+            plain: (B,) bool, frames whose attributes are those of the texture branch alone; None:
+                no frame.
         """
         if dark is None:
-            hands = {side: _in_frames(clip.parameters[side], rows) for side in self.rigs}
+            hands = {
+                side: (pose[rows], betas, transl[rows])
+                for side, (pose, betas, transl) in clip.parameters.items()
+            }
             dark = self.cast(hands)
         temporal = {side: self.biases_of(side).temporal(rows) for side in self.perturbation}
-        shares = None if teach is None else teach(self._largest_omega(temporal, rows))
+        shares = None
+        if teach is not None:
+            omegas = [hand.omega.detach() for hand in temporal.values()]
+            shares = teach(largest(omegas) if omegas else self.log_gains.new_zeros(len(rows)))
         states, parts = {}, []
         for index, (side, rig) in enumerate(self.rigs.items()):
             anchors = clip.hand(side, rows)
@@ -203,12 +213,19 @@ class WildGHandModel(nn.Module):
             prediction = self.predict(
                 side, anchors, pose.detach(), None if features is None else features[side]
             )
+            if plain is not None:
+                known = self.network.features(side) if features is None else features[side]
+                alone = self.network.attributes_of_texture(side, known).concatenate()
+                mixed = torch.where(plain[:, None, None], alone, prediction.raw.concatenate())
+                prediction = replace(prediction, raw=RawAttributes.split(mixed))
             prediction = dimmed(prediction, dark.get(side))
             if refine:
                 step = prediction.refinement
                 if shares is not None:
                     step = scale_refinement(step, shares)
                 pose, betas, transl = pose + step.pose, betas + step.betas, transl + step.transl
+                if side in self.perturbation:
+                    pose, transl = self.biases_of(side).move(pose, transl, temporal[side].z)
             if move or refine:
                 anchors = rig.follow(pose, betas, transl)
             perturbation, omega = None, pose.new_zeros(len(rows))
@@ -226,12 +243,6 @@ class WildGHandModel(nn.Module):
         # The image lies over black, so a gain on it is one on every Gaussian.
         image = image * self.log_gains[rows].exp()[:, None, None]
         return RenderedFrames(image, coverage, states)
-
-    def _largest_omega(self, temporal: Mapping[str, Temporal], rows: Tensor) -> Tensor:
-        """(B,) the temporal weight of largest magnitude among the hands, without gradient."""
-        if not temporal:
-            return self.log_gains.new_zeros(len(rows))
-        return largest([hand.omega.detach() for hand in temporal.values()])
 
     def perturbation_in(
         self, side: str, temporal: Temporal, anchors: AnchorPoses, kept: Tensor | None
@@ -254,8 +265,6 @@ class WildGHandModel(nn.Module):
         height: int,
         *,
         refine: bool = False,
-        features: Mapping[str, HandFeatures] | None = None,
-        dark: Mapping[str, Tensor] | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Draw hands in any pose, free of what perturbed the training frames.
 
@@ -267,21 +276,14 @@ class WildGHandModel(nn.Module):
             Ks: (B, 3, 3) px.
             width, height: px.
             refine: apply the network's refinement of the parameters (head iv).
-            features: of the network by side, where they are at hand already.
-            dark: (B, N) factors of the hands' shadows by side, where they are at hand already.
 
         Returns:
             (B, H, W, 3) sRGB over black and (B, H, W, 1) coverage.
         """
-        dark = self.cast(hands) if dark is None else dark
+        dark = self.cast(hands)
         found = {
             side: self.gaussians(
-                side,
-                *hands[side],
-                refine=refine,
-                viewmats=viewmats,
-                features=None if features is None else features[side],
-                dark=dark.get(side),
+                side, *hands[side], refine=refine, viewmats=viewmats, dark=dark.get(side)
             )
             for side in self.rigs
             if side in hands
@@ -321,7 +323,6 @@ class WildGHandModel(nn.Module):
         refine: bool = False,
         viewmats: Tensor | None = None,
         rows: Tensor | None = None,
-        features: HandFeatures | None = None,
         dark: Tensor | None = None,
     ) -> tuple[Gaussians, Hand]:
         """The Gaussians of one hand in any pose, free of perturbations unless frames are named.
@@ -335,13 +336,12 @@ class WildGHandModel(nn.Module):
             viewmats: (B, 4, 4) of the cameras that look at them; with these, skin that faces them
                 with a normal that no training frame has shown is drawn by the fitted light.
             rows: (B,) positions among the training frames, whose biases and gains are added.
-            features: of the network, where they are at hand already.
             dark: (B, N) factors of the hands' shadows; None: of those that it casts on itself.
         """
         hand = pose, betas, transl
         if dark is None:
             dark = self.cast({side: hand}).get(side)
-        predicted = self.predict_hand(side, hand, viewmats, features)
+        predicted = self.predict_hand(side, hand, viewmats)
         return self.dressed(side, predicted, refine=refine, rows=rows, dark=dark)
 
     def predict_hand(
@@ -449,14 +449,6 @@ def dimmed(prediction: NetworkOutput, dark: Tensor | None) -> NetworkOutput:
     return replace(prediction, shadow=prediction.shadow * dark[..., None])
 
 
-def _in_frames(
-    parameters: tuple[Tensor, Tensor, Tensor], rows: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """The parameters of a hand in some frames of a clip."""
-    pose, betas, transl = parameters
-    return pose[rows], betas, transl[rows]
-
-
 def make_model(
     templates: Mapping[str, HandTemplate],
     settings: WildGHandSettings,
@@ -486,9 +478,9 @@ def make_model(
             network,
             frame_count,
             dpd=dpd.enabled,
-            rank=dpd.rank,
+            rank=dpd.rank if dpd.additions else 0,
+            poses=dpd.poses,
             template=settings.heads,
-            shadows=settings.shadows,
         )
     if subject is not None:
         model.keep(subject)

@@ -17,16 +17,21 @@ from hwp_bench.base.records import flattened, merged
 from hwp_bench.methods.settings import check_source, choice, number, settings_from
 from wildghand.dpd.dpd import DpdSettings
 from wildghand.evidence import EvidenceSettings
-from wildghand.light import LightSettings, ShadowSettings
 from wildghand.model.terms import TermSettings
 from wildghand.network.settings import SIZES, NetworkSettings, network_settings
-from wildghand.pao.pao import PAPER_PAO, PaoSettings
-from wildghand.poses.errors import PoseSettings
+from wildghand.pao.pao import PaoSettings
 from wildghand.prepass import PrepassSettings
-from wildghand.subject import SubjectSettings
 
 #: Where messages place a wrong setting.
 WHERE = "wildghand"
+
+
+@dataclass(frozen=True)
+class Switch:
+    """An addition whose numbers are constants beside their use."""
+
+    #: Whether it is a part of the fit.
+    enabled: bool = True
 
 
 @dataclass(frozen=True)
@@ -54,15 +59,17 @@ class NetworkChoice:
 class ScheduleSettings:
     """Steps of the optimizer."""
 
-    #: Optimizer steps unless the budget says otherwise.
+    #: Optimizer steps unless epochs or the budget say otherwise.
     steps: int = number(2_000, 1, 10_000_000)
-    #: Frames in each step.
-    batch: int = number(1, 1, 64)
+    #: How often a fit looks at every frame, unless the budget says otherwise; 0: `steps` counts.
+    epochs: int = number(0, 0, 1_000_000)
+    #: Frames in each step; 0: one for each hand, in every process.
+    batch: int = number(1, 0, 64)
     #: Steps that share one evaluation of the texture branch, which moves at the last of them.
     texture_every: int = number(8, 1, 64)
-    #: How rates fall: `root` (to 0.3, and with the root of the steps, so that a long fit ends with
-    #: lower rates than a short one), `geometric` (to 0.05) or `halving` (ten times).
-    decay: str = choice("root", "geometric", "halving")
+    #: How `fast` rates fall: `root` (to 0.3, and with the root of the steps, so that a long fit
+    #: ends with lower rates than a short one) or `geometric` (to 0.05).
+    decay: str = choice("root", "geometric")
     #: The fit ends with a mean of its steps, nearly all of it from this share of them, the last
     #: ones; 0: with the last step.
     average_share: float = number(0.1, 0.0, 1.0)
@@ -74,10 +81,12 @@ class ScheduleSettings:
     frames_per_second: float = number(4.0, 0.0, 1e6)
     #: Stop when the loss has not fallen by 0.1 % over this many steps; 0 never stops early.
     plateau_steps: int = number(0, 0, 10_000_000)
-    #: Adam's steps for the network at the start: `fast`, or the authors' `published`.
-    rates: str = choice("fast", "published")
-    #: Adam's step for DPD.
-    dpd_rate: float = number(1e-3, 0.0, 1.0)
+    #: Adam's steps and constants: `fast`, ours; the `paper`'s, halved every five epochs; or the
+    #: authors' code's (`released`), the same, where gradients that are not finite count as 0.
+    rates: str = choice("fast", "paper", "released")
+    #: Chance that head (i) sees the texture branch alone in a frame of a step; 0.3 where the
+    #: authors' code has this on (`pose_reg`).
+    geometry_dropout: float = number(0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -104,13 +113,13 @@ class WildGHandSettings:
     #: Component: template offsets (head iii) and refinement of the hand parameters (head iv).
     heads: bool = True
     #: Addition: given poses are corrected by what the clip's poses have in common.
-    poses: PoseSettings = field(default_factory=PoseSettings)
+    poses: Switch = field(default_factory=Switch)
     #: Addition: the template is bent to the person before the fit.
-    subject: SubjectSettings = field(default_factory=SubjectSettings)
+    subject: Switch = field(default_factory=Switch)
     #: Addition: a light for normals that no frame has shown.
-    light: LightSettings = field(default_factory=LightSettings)
+    light: Switch = field(default_factory=Switch)
     #: Addition: shadows that the hands cast on themselves and on each other.
-    shadows: ShadowSettings = field(default_factory=ShadowSettings)
+    shadows: Switch = field(default_factory=Switch)
     #: Addition: Gaussians that few frames show are discs on the skin.
     evidence: EvidenceSettings = field(default_factory=EvidenceSettings)
     #: Addition: the judge of the frames. It says where the temporal weights start, which pixels are
@@ -130,65 +139,54 @@ class WildGHandSettings:
         check_source(self.perceptual, "perceptual", ("filter-bank",), ("vgg19",))
 
 
-#: What the paper and the authors' code have in common, in place of the defaults.
-_PUBLISHED: Mapping[str, Any] = MappingProxyType(
+#: What the paper and the authors' code do without, in place of the defaults.
+_BARE: Mapping[str, Any] = MappingProxyType(
     {
-        "dpd": {"rank": 0, "gains": False},
-        "pao": {
-            "variant": PAPER_PAO.variant,
-            "errors": "batch",
-            "beta": PAPER_PAO.beta,
-            "error_threshold": PAPER_PAO.error_threshold,
-            "share_threshold": PAPER_PAO.share_threshold,
-        },
         "start_colors": False,
-        "poses": {"enabled": False},
-        "subject": {"enabled": False},
-        "light": {"enabled": False},
-        "shadows": {"enabled": False},
-        "evidence": {"enabled": False},
-        "prepass": {"enabled": False},
-        "schedule": {
-            "batch": 4,
-            "texture_every": 1,
-            "decay": "halving",
-            "average_share": 0.0,
-            "validated": False,
-            "dpd_rate": 1e-4,
-        },
-        "terms": {
-            "weights": "published",
-            "dssim_weight": 0.0,
-            "leave_hidden": False,
-            "surface": 0.0,
-            "perceptual": 0.1,
+        "schedule": {"validated": False},
+        "terms": {"surface": 0.0, "leave_hidden": False},
+        **{
+            name: {"enabled": False}
+            for name in ("poses", "subject", "light", "shadows", "evidence", "prepass")
         },
     }
 )
+_PUBLISHED = merged(
+    _BARE,
+    {
+        "dpd": {"additions": False},
+        "schedule": {
+            "epochs": 50,
+            "texture_every": 1,
+            "average_share": 0.0,
+            "frames_per_second": 0.0,
+        },
+        # Without PAO every pixel counts, as in Eq. 7 without W.
+        "terms": {"dssim_weight": 0.0, "outside_weight": 1.0, "perceptual": 0.1},
+    },
+)
+_PAPER = {
+    "pao": {"variant": "printed"},
+    "schedule": {"batch": 4, "rates": "paper"},
+    "terms": {"weights": "paper"},
+}
+_RELEASED = {
+    "dpd": {"poses": True},
+    "pao": {"variant": "released"},
+    "schedule": {"batch": 0, "rates": "released"},
+    "terms": {"weights": "released"},
+}
 
 #: The modes: settings by name, in place of the defaults. `default`: what measurements keep.
 #: `paper`: the formulas as printed, in the reading that works. `released`: what the authors' code
-#: does, where the temporal factor is a constant 1. docs/dpd_pao.md compares the three. `bare`: the
-#: network alone, what the paper's components are added to (`baselines/network-scratch`).
+#: does. docs/dpd_pao.md compares the three. `bare`: the network alone, what the paper's components
+#: are added to (`baselines/network-scratch`).
 MODES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     {
         "default": {},
-        "paper": merged(_PUBLISHED, {"pao": {"temporal": "all"}}),
-        "released": merged(_PUBLISHED, {"pao": {"temporal": "none"}}),
-        "bare": {
-            "prior": "",
-            "dpd": {"enabled": False},
-            "pao": {"enabled": False},
-            "start_colors": False,
-            "poses": {"enabled": False},
-            "subject": {"enabled": False},
-            "light": {"enabled": False},
-            "shadows": {"enabled": False},
-            "evidence": {"enabled": False},
-            "prepass": {"enabled": False},
-            "schedule": {"validated": False},
-            "terms": {"surface": 0.0, "leave_hidden": False},
-        },
+        "paper": merged(_PUBLISHED, _PAPER),
+        "released": merged(_PUBLISHED, _RELEASED),
+        "bare": merged(_BARE, {"prior": "", "dpd": {"enabled": False}, "pao": {"enabled": False}}),
     }
 )
 
@@ -269,9 +267,8 @@ def _without_idle_parts(settings: WildGHandSettings) -> WildGHandSettings:
         settings,
         dpd=dataclasses.replace(
             dpd,
-            rank=dpd.rank if dpd.enabled and dpd.biases else 0,
-            gains=dpd.enabled and dpd.gains,
-            pay_back=dpd.pay_back if dpd.enabled and dpd.biases else 0.0,
+            additions=dpd.enabled and dpd.additions,
+            poses=dpd.enabled and dpd.poses,
         ),
         pao=dataclasses.replace(
             pao,

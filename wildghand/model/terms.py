@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -25,7 +25,7 @@ SURFACE_INEXACT = 5.0
 
 @dataclass(frozen=True)
 class TermWeights:
-    """Weights of the terms that are not settings: the paper's, or these by default.
+    """Weights and forms of the terms that are not settings.
 
     The defaults are the authors' weights divided by their 100 for the reconstruction, but for
     the two terms that cost the clean fit several dB: opacity and silhouette.
@@ -45,30 +45,45 @@ class TermWeights:
     laplacian_scales: float = 1e-3
     #: `SurfaceLaplacian.roughness` of the colours.
     laplacian_colors: float = 1e-3
-    #: `silhouette`: coverage against the hand's mask.
+    #: `silhouette`: coverage against the posed hands.
     silhouette: float = 0.0
     #: `weight_reward`: keeps PAO from weighing everything with 0.
     weight_reward: float = 5e-3
     #: `cross_hand`: texture features of the two hands, where there are two.
     cross_hand: float = 1e-3
+    #: Distances to one are squared, and not the norms that Eq. 8 prints.
+    squared_distances: bool = True
+    #: As in the authors' code, the bias term is the square of the sum of the attributes' mean
+    #: biases before omega, and the texture term of squares, in place of l1 norms.
+    squared_sums: bool = False
 
 
-#: By the setting `terms.weights`. The paper's: reconstruction, silhouette, the two other
-#: Laplacians and the texture term are the authors', whom the paper does not contradict.
+#: The terms of Eq. 7 and 8. The paper prints no weight for the reconstruction and the texture term:
+#: these two are the authors'.
+_PAPER = TermWeights(
+    reconstruction=100.0,
+    bias=0.1,
+    shadow=0.001,
+    opacity=0.1,
+    laplacian_offsets=0.1,
+    laplacian_scales=0.0,
+    laplacian_colors=0.0,
+    weight_reward=0.5,
+    cross_hand=0.1,
+    squared_distances=False,
+)
+#: By the setting `terms.weights`.
 WEIGHTS: Mapping[str, TermWeights] = MappingProxyType(
     {
         "ours": TermWeights(),
-        "published": TermWeights(
-            reconstruction=100.0,
-            bias=0.1,
-            shadow=0.001,
-            opacity=0.1,
-            laplacian_offsets=0.1,
+        "paper": _PAPER,
+        "released": replace(
+            _PAPER,
             laplacian_scales=0.1,
             laplacian_colors=0.1,
             silhouette=1.0,
-            weight_reward=0.5,
-            cross_hand=0.1,
+            squared_distances=True,
+            squared_sums=True,
         ),
     }
 )
@@ -78,8 +93,9 @@ WEIGHTS: Mapping[str, TermWeights] = MappingProxyType(
 class TermSettings:
     """The terms of the loss."""
 
-    #: The weights of all terms that are not named here: `ours` or `published`.
-    weights: str = choice("ours", "published")
+    #: Weights and forms of the terms that are not named here: `ours`, those of the `paper`'s Eq. 7
+    #: and 8, or those of the authors' code (`released`).
+    weights: str = choice("ours", "paper", "released")
     #: Share of D-SSIM in the reconstruction; the rest is L1.
     dssim_weight: float = number(0.2, 0.0, 1.0)
     #: Weight in the reconstruction of a pixel outside the visible-hand mask; inside it is 1.
@@ -143,17 +159,18 @@ class _BiasSize(torch.autograd.Function):
         return tuple(tensor.sign().mul_(share) for tensor in ctx.saved_tensors)
 
 
-def distance_to_one(values: Tensor) -> Tensor:
-    """Mean of (x - 1)^2: for shadow coefficients and opacities, any shape."""
-    return (values - 1.0).square().mean()
+def distance_to_one(values: Tensor, *, squared: bool = True) -> Tensor:
+    """Mean of (x - 1)^2 or |x - 1|: for shadow coefficients and opacities, any shape."""
+    away = values - 1.0
+    return (away.square() if squared else away.abs()).mean()
 
 
 def silhouette(coverage: Tensor, hand: Tensor) -> Tensor:
-    """Mean of (alpha - y_h)^2; the authors', not in the paper.
+    """Mean of (alpha - s)^2; the authors', not in the paper.
 
     Args:
         coverage: (B, H, W) or (B, H, W, 1) alpha of the rendering.
-        hand: (B, H, W), bool or in [0, 1].
+        hand: (B, H, W) bool, s: where the posed mesh is, whatever covers it.
     """
     if coverage.ndim == hand.ndim + 1:
         coverage = coverage.squeeze(-1)
@@ -190,12 +207,13 @@ def weight_reward(sizes: Tensor) -> Tensor:
     return -sizes.mean()
 
 
-def cross_hand(left: Tensor, right: Tensor) -> Tensor:
-    """Mean of |T_left - T_right|: texture features of the two hands, (N, F) each."""
+def cross_hand(left: Tensor, right: Tensor, *, squared: bool = False) -> Tensor:
+    """Mean of |T_left - T_right| or its square: texture features of both hands, (N, F) each."""
     if left.shape != right.shape:
         raise ShapeMismatch(
             f"have the shapes {tuple(left.shape)} and {tuple(right.shape)}",
             field="left, right",
             remedy="Both hands need as many Gaussians.",
         )
-    return (left - right).abs().mean()
+    apart = left - right
+    return (apart.square() if squared else apart.abs()).mean()

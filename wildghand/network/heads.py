@@ -102,15 +102,16 @@ class AttributeHead(nn.Module):
                 self.direct.weight[:, :CHANNELS] = torch.diag(torch.tensor(DIRECT_GAINS))
 
     def forward(
-        self, hidden: Tensor, x_g: Tensor, latent: Tensor, initial: Tensor
+        self, hidden: Tensor, x_g: Tensor | None, latent: Tensor, initial: Tensor
     ) -> RawAttributes:
         """Raw attributes (B, N, k).
 
-        `hidden` (N, width) is from the texture features, `x_g` (B, N, Fg) the geometry features,
+        `hidden` (N, width) is from the texture features, `x_g` (B, N, Fg) the geometry features
+        (None: the texture branch alone, (N, k)),
         `latent` (N, I) the identity features (I is 0 without the direct path), `initial` (N, 14)
         the start.
         """
-        change = self.attributes(hidden + self.geometry(x_g))
+        change = self.attributes(hidden if x_g is None else hidden + self.geometry(x_g))
         canonical = initial.to(change.dtype)
         if self.direct is not None:
             canonical = canonical + self.direct(latent)

@@ -204,6 +204,14 @@ class PredictionNetwork(nn.Module):
             texture=hand.texture,
         )
 
+    def attributes_of_texture(self, side: str, features: HandFeatures) -> RawAttributes:
+        """(N, k) attributes before their activation, by the texture branch alone."""
+        with self._precision():
+            raw = self.attribute_head(
+                features.hidden, None, self._latent(side), self._initial(side)
+            )
+        return raw.map(torch.Tensor.float) if self.mixed_precision else raw
+
     def _precision(self) -> contextlib.AbstractContextManager[object]:
         if not self.mixed_precision:
             return contextlib.nullcontext()

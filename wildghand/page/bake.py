@@ -14,9 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from hwp_bench.hands import pose_hand
+from hwp_bench.hands import anchor_normals, pose_hand
 from hwp_bench.hands.articulation import axis_angle_to_matrix
 from hwp_bench.hands.skeleton import PARENTS
+from hwp_bench.methods.contract import HandPose
 from wildghand.avatar import PosedGaussians, WildGHandAvatar
 from wildghand.gaussians.rig import HandRig
 from wildghand.model.dress import Gaussians
@@ -87,21 +88,26 @@ class BakedHand:
 
     def motions(self, pose: np.ndarray, transl: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Blended motions of the Gaussians: (N, 3, 3) and (N, 3) m."""
-        turns, shifts = joint_motions(self.joints, pose, transl)
-        linear = np.einsum("nk,nkij->nij", self.weights, turns[self.influences])
-        return linear, np.einsum("nk,nki->ni", self.weights, shifts[self.influences])
+        return blended_motions(self.joints, self.influences, self.weights, pose, transl)
+
+
+def blended_motions(
+    joints: np.ndarray,
+    influences: np.ndarray,
+    weights: np.ndarray,
+    pose: np.ndarray,
+    transl: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Linear blend skinning of points by the joints that move them; see `BakedHand.motions`."""
+    turns, shifts = joint_motions(joints, pose, transl)
+    linear = np.einsum("nk,nkij->nij", weights, turns[influences])
+    return linear, np.einsum("nk,nki->ni", weights, shifts[influences])
 
 
 def joint_motions(
     joints: np.ndarray, pose: np.ndarray, transl: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rotations (16, 3, 3) and shifts (16, 3) m of the joints, as `hwp_bench.hands.pose_hand`.
-
-    Args:
-        joints: (16, 3) m, at rest.
-        pose: (16, 3) axis-angle, rad.
-        transl: (3,) m.
-    """
+    """Rotations (16, 3, 3) and shifts (16, 3) m of the joints, as `hwp_bench.hands.pose_hand`."""
     turns = _rotations(pose)
     places = joints.copy()
     for joint, parent in enumerate(PARENTS):
@@ -122,26 +128,22 @@ def pose_features(poses: np.ndarray) -> np.ndarray:
 def bake_hand(
     avatar: WildGHandAvatar, side: str, poses: np.ndarray, *, geometry_rank: int, color_rank: int
 ) -> BakedHand:
-    """Bake one hand from its Gaussians in some poses.
-
-    Args:
-        poses: (P, 16, 3) rad, at least one; covariances are those of the first.
-    """
+    """Bake one hand from its Gaussians in poses (P, 16, 3); covariances are of the first."""
     rig, betas = avatar.model.rigs[side], avatar.betas[side]
     shape = torch.as_tensor(betas, dtype=torch.float32, device=rig.template.joints.device)
     joints = (rig.template.joints + rig.template.joint_basis @ shape).double().cpu().numpy()
     wall = avatar.model.wall(side)
     influences, weights = _skin(rig, wall)
-    gaussians = [gaussians_of(avatar, side, pose, np.zeros(3)) for pose in poses]
-    empty = PoseBasis(*(np.zeros((0,)) for _ in range(5)))
-    hand = BakedHand(
-        joints, influences, weights, empty, empty, np.zeros(0), gaussians[0].opacities, np.zeros(0)
-    )
+    gaussians = []
+    for pose in poses:
+        hand = HandPose(side, pose, betas, np.zeros(3))
+        gaussians.append(avatar.pose({side: hand}, closed=True))
+        gaussians[-1].require_finite()
     rest = np.empty((len(poses), len(influences), 3), dtype=np.float32)
     for row, (pose, drawn) in enumerate(zip(poses, gaussians, strict=True)):
-        linear, shifts = hand.motions(pose, np.zeros(3))
+        linear, shifts = blended_motions(joints, influences, weights, pose, np.zeros(3))
         rest[row] = np.linalg.solve(linear, (drawn.means - shifts)[..., None])[..., 0]
-    linear, _ = hand.motions(poses[0], np.zeros(3))
+    linear, _ = blended_motions(joints, influences, weights, poses[0], np.zeros(3))
     inverse = np.linalg.inv(linear)
     covariance = inverse @ _covariances(gaussians[0]) @ inverse.swapaxes(1, 2)
     rows, columns = np.triu_indices(3)
@@ -156,18 +158,6 @@ def bake_hand(
         opacities=np.mean([drawn.opacities for drawn in gaussians], axis=0),
         normals=_rest_normals(rig, wall, shape),
     )
-
-
-def gaussians_of(
-    avatar: WildGHandAvatar, side: str, pose: np.ndarray, transl: np.ndarray
-) -> PosedGaussians:
-    """The Gaussians of one hand and its wall as the avatar poses them, with its own shape."""
-    from hwp_bench.methods.contract import HandPose
-
-    hand = HandPose(side, pose, avatar.betas[side], transl)
-    made = avatar.pose({side: hand}, closed=True)
-    made.require_finite()
-    return made
 
 
 def _rotations(vectors: np.ndarray) -> np.ndarray:
@@ -191,8 +181,6 @@ def _skin(rig: HandRig, wall: WristWall | None) -> tuple[np.ndarray, np.ndarray]
 
 
 def _rest_normals(rig: HandRig, wall: WristWall | None, shape: torch.Tensor) -> np.ndarray:
-    from hwp_bench.hands import anchor_normals
-
     zeros = shape.new_zeros(1, 16, 3), shape, shape.new_zeros(1, 3)
     vertices = pose_hand(rig.template, *zeros).vertices
     normals = anchor_normals(vertices, rig.template.faces, rig.anchors)[0].cpu().numpy()
@@ -222,14 +210,7 @@ def _basis(values: np.ndarray, poses: np.ndarray, rank: int) -> PoseBasis:
     """Principal components of (P, N, 3) values in P poses, and their regression on these."""
     count = len(values)
     mean = values.mean(axis=0, dtype=np.float64)
-    flat = (values - mean).reshape(count, -1)
-    # The Gram matrix is small: there are fewer poses than Gaussians.
-    power, vectors = np.linalg.eigh(flat @ flat.T)
-    order = np.argsort(power)[::-1][: min(rank, count - 1)]
-    order = order[power[order] > 1e-9 * max(power.max(), 1e-30)]
-    roots = np.sqrt(power[order])
-    components = (flat.T @ (vectors[:, order] / roots)).T.reshape(len(order), len(mean), 3)
-    coefficients = vectors[:, order] * roots
+    components, coefficients = _principal(values - mean, min(rank, count - 1))
     peaks = np.abs(components).max(axis=(1, 2), initial=1e-30)
     regression = _ridge(pose_features(poses), coefficients)
     bounds = np.stack([coefficients.min(axis=0), coefficients.max(axis=0)])
@@ -295,10 +276,9 @@ def bake_biases(
     motion: np.ndarray,
     rank: int,
 ) -> FrameBiases | None:
-    """Bake the biases of some training frames; None where the avatar has none.
+    """Bake the biases of F training frames, with their poses and translations (F, 51).
 
-    Args:
-        motion: (F, 51) their poses (48, rad) and translations (m).
+    None where the avatar has none.
     """
     model = avatar.model
     if side not in model.perturbation or not len(frames) or rank < 1:
@@ -330,26 +310,31 @@ def _differences(clean: Gaussians, biased: Gaussians, count: int) -> np.ndarray:
     def number(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
         return (b - a).expand(count, *torch.broadcast_shapes(a.shape, b.shape)[-2:])
 
+    scales = [each.scales.log().mean(dim=-1, keepdim=True) for each in (clean, biased)]
     parts = [
         number(clean.means, biased.means),
         number(clean.colors, biased.colors),
         number(clean.opacities[..., None], biased.opacities[..., None]),
-        number(
-            clean.scales.log().mean(dim=-1, keepdim=True),
-            biased.scales.log().mean(dim=-1, keepdim=True),
-        ),
+        number(*scales),
     ]
     return torch.cat(parts, dim=-1).cpu().numpy()
 
 
 def _components(values: np.ndarray, rank: int) -> FrameBiases:
     """Principal components, about zero, of (F, N, 8) values in units of `_UNITS`."""
+    components, coefficients = _principal(values, rank)
+    peaks = np.abs(components).max(axis=1, initial=1e-30)
+    whole = np.rint(components / peaks[:, None] * 127.0).astype(np.int8)
+    return FrameBiases(whole, peaks / 127.0 * _UNITS, coefficients)
+
+
+def _principal(values: np.ndarray, rank: int) -> tuple[np.ndarray, np.ndarray]:
+    """Components (K, N, C) of length 1 and coefficients (P, K) of (P, N, C) values."""
     flat = values.reshape(len(values), -1)
+    # The Gram matrix is small: there are fewer poses than Gaussians.
     power, vectors = np.linalg.eigh((flat @ flat.T).astype(np.float64))
     order = np.argsort(power)[::-1][:rank]
     order = order[power[order] > 1e-9 * max(float(power.max()), 1e-30)]
     roots = np.sqrt(power[order])
-    components = (flat.T @ (vectors[:, order] / roots)).T.reshape(len(order), *values.shape[1:])
-    peaks = np.abs(components).max(axis=1, initial=1e-30)
-    whole = np.rint(components / peaks[:, None] * 127.0).astype(np.int8)
-    return FrameBiases(whole, peaks / 127.0 * _UNITS, vectors[:, order] * roots)
+    components = (flat.T @ (vectors[:, order] / roots)).T
+    return components.reshape(len(order), *values.shape[1:]), vectors[:, order] * roots

@@ -1,4 +1,4 @@
-"""Writes the page of an avatar: data, scripts and styles in one file."""
+"""Writes the page of an avatar: its poses, data, scripts and styles in one file."""
 
 from __future__ import annotations
 
@@ -6,34 +6,261 @@ import base64
 import dataclasses
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
+import torch
 
+from hwp_bench.base.arrays import evenly
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import atomic_write
 from hwp_bench.capture import Capture
+from hwp_bench.hands import anatomical_limits, load_template, pose_from_joint_angles
+from hwp_bench.methods.contract import Camera, HandPose
 from hwp_bench.report.page import render_template
-from wildghand.avatar import WildGHandAvatar, load_avatar
-from wildghand.avatar.avatar import InlinePicture
+from wildghand.avatar import PosedGaussians, WildGHandAvatar, load_avatar
+from wildghand.avatar.avatar import InlinePicture, splat
+from wildghand.avatar.render import shown_sides
 from wildghand.avatar.studio import REST
+from wildghand.evidence.count import seen_anchors
+from wildghand.gaussians.quaternions import matrix_to_quat
 from wildghand.page.bake import BakedHand, FrameBiases, PoseBasis, bake_biases, bake_hand
-from wildghand.page.poses import (
-    Fidelity,
-    PageSettings,
-    PoseSamples,
-    fidelity,
-    hand_controls,
-    mean_weights,
-    sample_poses,
-    still_image,
-)
 
 if TYPE_CHECKING:
     from markupsafe import Markup
+
+
+@dataclass(frozen=True)
+class PageSettings:
+    """How much of the avatar a page holds."""
+
+    #: Principal components of places and of colours that depend on the pose.
+    geometry_rank: int = 6
+    color_rank: int = 12
+    #: Principal components of the biases of the frames that are played; 0: pages cannot show them.
+    bias_rank: int = 4
+    #: Poses of the clip, and random ones within the limits of the joints, that are drawn to bake.
+    clip_samples: int = 80
+    random_samples: int = 48
+    #: Most training frames whose motion is played.
+    most_frames: int = 240
+    #: Edge of the still image for browsers without WebGL2, px.
+    still_size: int = 384
+    #: Of the random poses.
+    seed: int = 0
+
+
+# Each fourth frame at most is kept out of what is baked, this many at most.
+_HELD_OUT = 8
+
+
+@dataclass(frozen=True, eq=False)
+class PoseSamples:
+    """Poses of an avatar's hands."""
+
+    #: (P, 16, 3) rad by side: the pose at the start, poses of the clip, random ones.
+    baked: Mapping[str, np.ndarray]
+    #: The hands when the page is opened.
+    start: Mapping[str, HandPose]
+    #: Frames that are played, and (F, 51) their poses and translations by side.
+    frames: list[int]
+    motion: Mapping[str, np.ndarray]
+    #: Frames that were not baked, to measure with.
+    held_out: list[int]
+    #: (4, 4) of the camera at the start.
+    viewmat: np.ndarray
+    #: Frames a second.
+    fps: float
+
+
+def sample_poses(
+    avatar: WildGHandAvatar, capture: Capture | None, settings: PageSettings
+) -> PoseSamples:
+    """Choose poses."""
+    random = np.random.default_rng(settings.seed)
+    if capture is None:
+        # In the studio, where the light is as frames have shown it.
+        start = avatar.studio.posed()
+        clip = {side: start[side].pose[None] for side in avatar.sides}
+        frames, held_out, viewmat, fps = [], [], np.eye(4), 30.0
+        motion = {side: np.zeros((0, 51)) for side in avatar.sides}
+    else:
+        _check(avatar, capture)
+        fitted = [frame for frame in avatar.record.frames if _shown(avatar, capture, frame)]
+        if not fitted:
+            raise UsageError("has no fitted frame that shows every hand", where=capture.root)
+        frames = [fitted[pick] for pick in evenly(len(fitted), settings.most_frames)]
+        held_out = [fitted[pick] for pick in evenly(len(fitted), _HELD_OUT + 2)[1:-1]]
+        rest = [frame for frame in fitted if frame not in held_out] or fitted
+        drawn = [rest[pick] for pick in evenly(len(rest), settings.clip_samples)]
+        start = avatar.believed(capture.hand_poses(fitted[0]))
+        clip, motion = {}, {}
+        for side in avatar.sides:
+            poses = {f: avatar.believed(capture.hand_poses(f))[side] for f in fitted}
+            clip[side] = np.stack([start[side].pose, *(poses[frame].pose for frame in drawn)])
+            motion[side] = np.stack(
+                [np.append(poses[frame].pose.ravel(), poses[frame].transl) for frame in frames]
+            )
+        viewmat, fps = capture.camera(fitted[0]).viewmat, float(capture.info.fps)
+    baked = {
+        side: np.concatenate([poses, _random(avatar, side, poses, settings.random_samples, random)])
+        for side, poses in clip.items()
+    }
+    return PoseSamples(baked, start, frames, motion, held_out, viewmat, fps)
+
+
+def hand_controls(avatar: WildGHandAvatar, side: str) -> dict[str, Any]:
+    """Axes and ranges (degrees) of the 15 finger joints, for the page's sliders."""
+    limits = anatomical_limits(load_template(avatar.hand_model.source, side))
+    return {
+        "axes": limits.axes.tolist(),
+        "lower": np.rad2deg(limits.lower).round(1).tolist(),
+        "upper": np.rad2deg(limits.upper).round(1).tolist(),
+    }
+
+
+def _random(
+    avatar: WildGHandAvatar, side: str, clip: np.ndarray, count: int, random: np.random.Generator
+) -> np.ndarray:
+    """(count, 16, 3) poses within the limits of the joints; the wrist is as in the clip."""
+    limits = anatomical_limits(load_template(avatar.hand_model.source, side))
+    share = random.uniform(0.2, 1.0, (count, 1, 1))
+    angles = share * random.uniform(limits.lower, limits.upper, (count, 15, 3))
+    fingers = pose_from_joint_angles(torch.as_tensor(angles), torch.as_tensor(limits.axes))
+    wrists = clip[random.integers(0, len(clip), count), :1]
+    return np.concatenate([wrists, fingers.numpy()], axis=1)
+
+
+def _check(avatar: WildGHandAvatar, capture: Capture) -> None:
+    if len(shown_sides(avatar, capture)) < len(avatar.sides):
+        raise UsageError(
+            f"shows the {capture.info.hands} hand alone, the avatar has two", where=capture.root
+        )
+    origin, fitted = avatar.record.source.get("capture"), avatar.record.frames
+    if origin not in (None, capture.info.id) or not fitted or max(fitted) >= len(capture):
+        raise UsageError(
+            f"is {capture.info.id!r}, the avatar was fitted to {str(origin)[:100]!r}",
+            where=capture.root,
+        )
+
+
+def _shown(avatar: WildGHandAvatar, capture: Capture, frame: int) -> bool:
+    return all(bool(capture.hands[side].valid[frame]) for side in avatar.sides)
+
+
+# Field of view of the still image, and how much of it the hand fills.
+_FOCAL, _FILLED = 2.0, 0.8
+
+
+@dataclass(frozen=True)
+class Fidelity:
+    """PSNR over the hand's box against `WildGHandAvatar.render`, dB; of the mean square error."""
+
+    #: As the page draws: joints, and linear parts.
+    baked: float
+    #: Joints alone, with the mean of the rest.
+    joints_only: float
+
+
+def fidelity(
+    avatar: WildGHandAvatar,
+    capture: Capture,
+    hands: Mapping[str, BakedHand],
+    frames: Sequence[int],
+) -> Fidelity | None:
+    """Compare both forms with the avatar in frames of a capture; None without frames."""
+    if not frames:
+        return None
+
+    def mean_only(basis: PoseBasis) -> PoseBasis:
+        return replace(basis, steps=np.zeros_like(basis.steps))
+
+    fixed = {
+        side: replace(hand, means=mean_only(hand.means), colors=mean_only(hand.colors))
+        for side, hand in hands.items()
+    }
+    errors: dict[str, list[float]] = {"baked": [], "joints_only": []}
+    for frame in frames:
+        poses, camera = capture.hand_poses(frame), capture.camera(frame)
+        poses = avatar.believed({side: poses[side] for side in avatar.sides})
+        truth = avatar.render(poses, camera)
+        seen = np.argwhere(truth[..., 3] > 0.5)
+        if not len(seen):
+            continue
+        box = tuple(slice(a, b + 1) for a, b in zip(seen.min(0), seen.max(0), strict=True))
+        for name, form in (("baked", hands), ("joints_only", fixed)):
+            drawn = draw_baked(form, poses, camera)
+            errors[name].append(float(np.square(drawn[box] - truth[..., :3][box]).mean()))
+    if not errors["baked"]:
+        return None
+    means = {name: -10.0 * np.log10(np.mean(each) + 1e-12) for name, each in errors.items()}
+    return Fidelity(**{name: round(float(mean), 2) for name, mean in means.items()})
+
+
+def draw_baked(
+    hands: Mapping[str, BakedHand], poses: Mapping[str, HandPose], camera: Camera
+) -> np.ndarray:
+    """(H, W, 3) sRGB over black of baked hands, by the project's own rasterizer."""
+    parts = [hand.posed(poses[side].pose, poses[side].transl) for side, hand in hands.items()]
+    means, covariances, colors = (np.concatenate(column) for column in zip(*parts, strict=True))
+    power, axes = np.linalg.eigh(covariances)
+    axes[np.linalg.det(axes) < 0.0, :, 0] *= -1.0
+
+    opacities = np.concatenate([hand.opacities for hand in hands.values()])
+    quats = matrix_to_quat(torch.as_tensor(axes, dtype=torch.float32)).numpy()
+    scales = np.sqrt(power.clip(min=0.0))
+    return splat(PosedGaussians(means, quats, scales, opacities, colors), camera)[..., :3]
+
+
+def still_image(avatar: WildGHandAvatar, samples: PoseSamples, size: int) -> bytes:
+    """PNG with transparency of the hands at the start, from the camera's side."""
+    poses = {side: samples.start[side] for side in avatar.sides}
+    means = avatar.pose(poses).means
+    centre = (means.min(axis=0) + means.max(axis=0)) / 2.0
+    radius = float(np.linalg.norm(means - centre, axis=1).max())
+    viewmat = samples.viewmat.copy()
+    viewmat[:3, 3] = [0.0, 0.0, radius * _FOCAL * 2.0 / _FILLED] - viewmat[:3, :3] @ centre
+    K = np.array([[_FOCAL * size, 0, size / 2], [0, _FOCAL * size, size / 2], [0, 0, 1]])
+    rgba = avatar.render(poses, Camera(K, viewmat, size, size))
+    straight = rgba[..., :3] / np.maximum(rgba[..., 3:], 1e-6)
+    whole = np.concatenate([straight[..., ::-1], rgba[..., 3:]], axis=-1).clip(0.0, 1.0)
+    return bytes(cv2.imencode(".png", np.rint(whole * 255.0).astype(np.uint8))[1])
+
+
+@torch.no_grad()
+def mean_weights(
+    avatar: WildGHandAvatar, capture: Capture, masks: Mapping[int, np.ndarray]
+) -> dict[str, np.ndarray]:
+    """Average weight masks (255 = full weight) over the frames that show each Gaussian's anchor.
+
+    Returns:
+        (N,) by side, in [0, 1]; NaN where no frame shows the anchor. Empty without masks.
+    """
+    rigs = avatar.model.rigs
+    sums = {side: np.zeros((2, len(rig))) for side, rig in rigs.items()}
+    for frame, mask in masks.items():
+        hands, camera = capture.hand_poses(frame), capture.camera(frame)
+        given = avatar.posed({side: hands[side] for side in rigs})
+        anchors = {side: rigs[side].pose(*values) for side, values in given.items()}
+        viewmat, K = (torch.as_tensor(m, dtype=torch.float32) for m in (camera.viewmat, camera.K))
+        size = torch.Size((camera.height, camera.width))
+        shown = seen_anchors(anchors, viewmat[None], K[None], size)
+        for side, (pixels, facing) in shown.items():
+            # Masks have the size of the frame, unless a person has made them smaller.
+            scale = np.array(mask.shape[::-1]) / (camera.width, camera.height)
+            x, y = (pixels[0].cpu().numpy() * scale - 0.5).astype(np.float32).T
+            weight = cv2.remap(mask, x[None], y[None], cv2.INTER_LINEAR)[0] / 255.0
+            counts = (facing[0] > 0.0).cpu().numpy()
+            sums[side] += counts * np.stack([weight, np.ones_like(weight)])
+    if not masks:
+        return {}
+    with np.errstate(invalid="ignore"):
+        return {side: total / count for side, (total, count) in sums.items()}
+
 
 # In the order in which they are run.
 _SCRIPTS = ("hand.js", "splats.js", "controls.js")
@@ -102,11 +329,50 @@ def write_page(
         for side, baked in hands.items()
     }
     weights = {} if capture is None else mean_weights(avatar, capture, avatar.weight_masks)
-    html = _html(avatar, hands, samples, measured, settings, biases, weights)
+    content = {
+        "hands": [
+            {
+                **_hand(baked),
+                **hand_controls(avatar, side),
+                "seen": _seen(avatar, side, len(baked)),
+                "biases": _biases(biases[side]),
+                "trusted": _trusted(weights.get(side), len(baked)),
+                "side": side,
+                "start": samples.start[side].pose.tolist(),
+                "transl": samples.start[side].transl.tolist(),
+                "motion": _pack(samples.motion[side].astype("<f4")),
+            }
+            for side, baked in hands.items()
+        ],
+        "viewmat": samples.viewmat.tolist(),
+        "fps": samples.fps,
+        "frames": samples.frames,
+        "omega": _by_frame(avatar, samples.frames),
+        "weights": _weights(avatar, samples.frames),
+    }
+    record, count = avatar.record, sum(len(baked) for baked in hands.values())
+    steps = f"{record.steps:,} steps"
+    if record.chosen_steps is not None:
+        steps = f"the state of step {record.chosen_steps:,} of {record.steps:,}"
+    facts = [f"{count:,} Gaussians", f"{steps} on {len(record.frames)} frames"]
+    if measured is not None:
+        facts.append(f"{measured.baked:.1f} dB from the avatar's own drawing")
+    still = base64.b64encode(still_image(avatar, samples, settings.still_size)).decode()
+    html = render_template(
+        "wildghand.page",
+        "avatar.html.j2",
+        title=f"{' and '.join(avatar.sides).capitalize()} hand",
+        source=str(record.source.get("capture", ""))[:80],
+        facts=", ".join(facts),
+        still=f"data:image/png;base64,{still}",
+        style=_text("style.css"),
+        scripts=[_text(name) for name in _SCRIPTS],
+        content=content,
+    )
     atomic_write(out, html, overwrite=overwrite, flag="--overwrite")
     return PageFacts(
         bytes=len(html.encode()),
-        gaussians=sum(len(baked) for baked in hands.values()),
+        gaussians=count,
         frames=len(samples.frames),
         fidelity=measured,
     )
@@ -130,57 +396,6 @@ def show_page(avatar: WildGHandAvatar, *, size: int = 320) -> InlinePicture:
         path = Path(folder) / "avatar.html"
         write_page(avatar, path)
         return dataclasses.replace(picture, page=path.read_text("utf-8"))
-
-
-def _html(
-    avatar: WildGHandAvatar,
-    hands: Mapping[str, BakedHand],
-    samples: PoseSamples,
-    measured: Fidelity | None,
-    settings: PageSettings,
-    biases: Mapping[str, FrameBiases | None],
-    weights: Mapping[str, np.ndarray],
-) -> str:
-    still = still_image(avatar, samples, settings.still_size)
-    content = {
-        "hands": [
-            {
-                **_hand(baked),
-                **hand_controls(avatar, side),
-                "seen": _seen(avatar, side, len(baked)),
-                "biases": _biases(biases[side]),
-                "trusted": _trusted(weights.get(side), len(baked)),
-                "side": side,
-                "start": samples.start[side].pose.tolist(),
-                "transl": samples.start[side].transl.tolist(),
-                "motion": _pack(samples.motion[side].astype("<f4")),
-            }
-            for side, baked in hands.items()
-        ],
-        "viewmat": samples.viewmat.tolist(),
-        "fps": samples.fps,
-        "frames": samples.frames,
-        "omega": _by_frame(avatar, samples.frames),
-        "weights": _weights(avatar, samples.frames),
-    }
-    facts = [f"{sum(len(baked) for baked in hands.values()):,} Gaussians"]
-    steps = f"{avatar.record.steps:,} steps"
-    if avatar.record.chosen_steps is not None:
-        steps = f"the state of step {avatar.record.chosen_steps:,} of {avatar.record.steps:,}"
-    facts.append(f"{steps} on {len(avatar.record.frames)} frames")
-    if measured is not None:
-        facts.append(f"{measured.baked:.1f} dB from the avatar's own drawing")
-    return render_template(
-        "wildghand.page",
-        "avatar.html.j2",
-        title=f"{' and '.join(avatar.sides).capitalize()} hand",
-        source=str(avatar.record.source.get("capture", ""))[:80],
-        facts=", ".join(facts),
-        still=f"data:image/png;base64,{base64.b64encode(still).decode()}",
-        style=_text("style.css"),
-        scripts=[_text(name) for name in _SCRIPTS],
-        content=content,
-    )
 
 
 def _text(name: str) -> Markup:
@@ -262,8 +477,7 @@ def _by_frame(avatar: WildGHandAvatar, frames: Sequence[int]) -> list[float]:
         return []
     table = np.array([*avatar.record.temporal.values()])
     largest = table[np.abs(table).argmax(axis=0), np.arange(table.shape[1])]
-    found = dict(zip(avatar.record.frames, largest.tolist(), strict=True))
-    return [round(found[frame], 4) for frame in frames]
+    return _of_frames(avatar, largest.tolist(), frames)
 
 
 def _weights(avatar: WildGHandAvatar, frames: Sequence[int]) -> list[float]:
@@ -271,5 +485,12 @@ def _weights(avatar: WildGHandAvatar, frames: Sequence[int]) -> list[float]:
     weights = avatar.record.frame_weights
     if len(weights) != len(avatar.record.frames) or np.ptp(weights) < 1e-9:
         return []
-    found = dict(zip(avatar.record.frames, weights, strict=True))
+    return _of_frames(avatar, weights, frames)
+
+
+def _of_frames(
+    avatar: WildGHandAvatar, values: Sequence[float], frames: Sequence[int]
+) -> list[float]:
+    """Of values of all fitted frames those of some."""
+    found = dict(zip(avatar.record.frames, values, strict=True))
     return [round(found[frame], 4) for frame in frames]

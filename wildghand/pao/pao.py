@@ -7,14 +7,16 @@ all regions, or the ordinary error of the region's places on the hand.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from types import MappingProxyType
+from typing import ClassVar, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from hwp_bench.base.errors import ShapeMismatch
-from hwp_bench.methods.settings import check_source, number
+from hwp_bench.methods.settings import check_source
 from wildghand.gaussians.losses import full_precision
 from wildghand.gaussians.training import upload
 from wildghand.pao.regions import ClipRegions, Regions
@@ -121,75 +123,73 @@ class PlaceErrors:
         self.ordinary = torch.cat([ordinary, self.ordinary[places.count :]])
 
 
-#: T_b at the start, for one hand and for two, as the authors have it: background pixels whose
-#: error, summed over channels, is above it have weight 0.
+#: T_b at the start, for one hand and for two, as the authors have it: where the error of the
+#: background is above it, the background has weight 0.
 BACKGROUND_THRESHOLDS = (3.0, 10.0)
+#: Coverage from which the authors' code takes a pixel for drawn.
+DRAWN_FROM = 0.95
 #: Colour channels: the paper's background error is their sum, its region error their mean.
 _CHANNELS = 3.0
-#: Errors that differ by less than this share are equal: stretching would show rounding.
-_EQUAL = 1e-4
+
+
+class Constants(NamedTuple):
+    """Factors, and thresholds at the start."""
+
+    #: Of every region's weight.
+    alpha: float
+    #: How strongly the temporal weight of a frame lowers its weight.
+    beta: float
+    #: T_E: regions with a larger error have weight 0.
+    error_threshold: float
+    #: T_mu: regions with a smaller share of hand have weight 0.
+    share_threshold: float
+
+
+#: The paper prints thresholds; alpha and beta are the authors' code's.
+_PUBLISHED = Constants(100.0, 1000.0, 1.0, 0.3)
+#: By variant. `scaled` counts errors in ordinary ones. With beta = 1000 an omega of 0.005, which is
+#: noise, would cost a frame five sixths of its weight.
+CONSTANTS: Mapping[str, Constants] = MappingProxyType(
+    {
+        "scaled": Constants(1.0, 100.0, 3.0, 0.0),
+        "printed": _PUBLISHED,
+        # Their temporal factor is 1 for every omega: it is rounded to an integer.
+        "released": _PUBLISHED._replace(beta=0.0),
+    }
+)
 
 
 @dataclass(frozen=True)
 class PaoSettings:
-    """Perturbation-aware weights; the modes `paper` and `released` have the paper's numbers."""
+    """Perturbation-aware weights."""
 
     #: Component: weigh frames and regions. Without it a pixel counts as the estimated mask says.
     enabled: bool = True
-    #: `scaled`: the paper's equations with weights up to alpha on the hand, and the constant
-    #: `terms.outside_weight` outside. `printed`: as printed. `binary`: the hand's mask alone (the
-    #: paper's table).
-    variant: Literal["scaled", "printed", "binary"] = "scaled"
+    #: `scaled`: the paper's equations with weights up to 1 on the hand, the constant
+    #: `terms.outside_weight` outside, and the temporal factor on what the canonical hand learns.
+    #: `printed`: as printed. `released`: as in the authors' code. `binary`: the hand's mask alone
+    #: (the paper's table).
+    variant: Literal["scaled", "printed", "released", "binary"] = "scaled"
     #: The regions y_u: `superpixels`, or `sam:PATH`, the masks of a Segment Anything checkpoint.
     regions: str = "superpixels"
     #: The hand y_h: the `estimated` mask of the capture; `graph-cut`, prompted by the projected
     #: hand; or `sam:PATH`, Segment Anything at the projected hand root, as in the paper.
     hand: str = "estimated"
-    #: What the temporal factor 1 / (1 + beta |omega|) scales. `teaching`: what the canonical hand
-    #: learns from a frame, while the frame's biases learn from all of it. `all`: W. `regions`: the
-    #: weights of regions alone, as printed. `none`: nothing, as in the authors' code.
-    temporal: Literal["teaching", "all", "regions", "none"] = "teaching"
-    #: What E_u is counted in. `place`: the ordinary error of the region's places on the hand
-    #: (`wildghand.pao.pao`). `median`: the running median of the regions' errors.
-    #: `batch`: from the smallest to the largest of a batch on [0, 1], as the authors do.
-    #: `absolute`: colours in [0, 1], as printed.
-    errors: Literal["place", "median", "batch", "absolute"] = "place"
-    #: How strongly the temporal weight of a frame lowers its weight; 0 = not at all.
-    beta: float = number(100.0)
-    #: T_E at the start: regions with a mean error above it have weight 0.
-    error_threshold: float = number(3.0)
-    #: T_mu at the start: regions with a smaller share of hand have weight 0.
-    share_threshold: float = number(0.0)
 
     #: How far a mismatch that every frame of the clip shares lifts the weights of regions towards
-    #: 1 (`wildghand.prepass.FrameAssessment.shared_mismatch`), with `errors` "place".
+    #: 1 (`wildghand.prepass.FrameAssessment.shared_mismatch`), in `scaled`.
     mismatch: ClassVar[float] = 1.0
     #: Lift the weights of a frame's regions towards 1 by the probability that the frame is clean,
-    #: as the pre-pass judges, with `errors` "place": a large error there is a fault of the fit.
+    #: as the pre-pass judges, in `scaled`: a large error there is a fault of the fit.
     spare_clean: ClassVar[bool] = True
-    #: Weight outside the hand in the variant `binary`: the paper gives no formula.
-    binary_outside: ClassVar[float] = 0.0
 
     def __post_init__(self) -> None:
         check_source(self.regions, "regions", ("superpixels",), ("sam",))
         check_source(self.hand, "hand", ("estimated", "graph-cut"), ("sam",))
 
-    @property
-    def alpha(self) -> float:
-        """Factor of every region's weight; as printed it is that of the authors' code."""
-        return 100.0 if self.variant == "printed" else 1.0
 
-
-#: The equations as printed, with the paper's thresholds; beta, which it does not print, is that of
-#: the authors' code.
-PAPER_PAO = PaoSettings(
-    variant="printed",
-    temporal="regions",
-    errors="absolute",
-    beta=1000.0,
-    error_threshold=1.0,
-    share_threshold=0.3,
-)
+#: The equations as printed, with the paper's thresholds.
+PAPER_PAO = PaoSettings(variant="printed")
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,8 +198,6 @@ class Weights:
 
     #: (B, H, W) W, not negative.
     weights: Tensor
-    #: (B, H, W) its background term, 0 on the hand.
-    background: Tensor
     #: (B, U) lambda_u.
     lambdas: Tensor
     #: (B, U) E_u, as compared with T_E; 0 where a region has no hand.
@@ -208,28 +206,22 @@ class Weights:
     mean_errors: Tensor
     #: (B, U) mu_u in [0, 1].
     shares: Tensor
-    #: (B,) 1 / (1 + beta |omega|) in (0, 1].
-    temporal: Tensor
-    #: (B,) means of W, which -lambda_W |W| rewards. With `temporal` "all" omega has a gradient
-    #: here, and nowhere else.
-    sizes: Tensor
 
 
 class PerturbationAwareWeights(nn.Module):
     """lambda_u and W from the error of the current rendering, with learnable thresholds.
 
     Args:
-        settings: factors, and the thresholds at the start.
+        variant: which `CONSTANTS`, and which of the two functions.
         hands: one or two; the background threshold differs.
         share_of: what mu is a share of. "hand" is the paper's formula, |region and hand| / |hand|,
             which needs regions as large as a hand; "region" its sentence, |region and hand| /
             |region|, which superpixels can reach too. "auto" takes the formula where regions may
             overlap (Segment Anything's) and the sentence for a partition into superpixels.
 
-    The thresholds need their own learning rate (the paper's is 1e-6). Gradients reach nothing
-    but them: a gradient through the errors would reward errors that lower a weight, and a gradient
-    through omega a larger omega. The size of W, which the loss rewards, has one of omega: as
-    printed it draws omega to 0.
+    The thresholds need their own learning rate (the paper's is 1e-6). In `forward` gradients reach
+    nothing but them: a gradient through the errors would reward errors that lower a weight, and a
+    gradient through omega a larger omega.
 
     Source: WildGHand, section "Perturbation-aware Optimization", equations of lambda_u and W,
     read so that they are defined everywhere; `docs/dpd_pao.md` lists the differences.
@@ -237,15 +229,16 @@ class PerturbationAwareWeights(nn.Module):
 
     def __init__(
         self,
-        settings: PaoSettings = PaoSettings(),
+        variant: str = "scaled",
         hands: int = 1,
         *,
         share_of: Literal["auto", "hand", "region"] = "auto",
     ) -> None:
         super().__init__()
-        self.settings, self._share_of = settings, share_of
-        self.T_E = nn.Parameter(torch.tensor(settings.error_threshold))
-        self.T_mu = nn.Parameter(torch.tensor(settings.share_threshold))
+        self.variant, self.constants = variant, CONSTANTS[variant]
+        self._share_of = share_of
+        self.T_E = nn.Parameter(torch.tensor(self.constants.error_threshold))
+        self.T_mu = nn.Parameter(torch.tensor(self.constants.share_threshold))
         self.T_b = nn.Parameter(torch.tensor(BACKGROUND_THRESHOLDS[hands > 1]))
 
     def forward(
@@ -254,10 +247,9 @@ class PerturbationAwareWeights(nn.Module):
         regions: Regions,
         hand: Tensor,
         omega: Tensor,
-        median: float | Tensor | None = None,
         expected: Tensor | None = None,
     ) -> Weights:
-        """Weigh B frames.
+        """Weigh B frames, as printed or `scaled`.
 
         Args:
             error: (B, H, W) mean over channels of |rendering - input|; a pixel that is not
@@ -266,17 +258,14 @@ class PerturbationAwareWeights(nn.Module):
             regions: y_u of the frames.
             hand: (B, H, W) y_h: bool, or coverage in [0, 1], hand where above a half.
             omega: (B,) temporal weights.
-            median: running median of `Weights.mean_errors`; None: that of these frames. Only
-                `errors` "median" and "place" read it.
-            expected: (B, H, W) ordinary error at each pixel, positive, in which `errors` "place"
-                counts; None: `median` is.
+            expected: (B, H, W) ordinary error at each pixel, positive, in which `scaled` counts;
+                None: the median of the regions' errors is.
 
         Raises:
             ShapeMismatch: the arguments do not describe the same frames.
         """
         _check_shapes(error, regions, hand, omega)
         error, omega = full_precision(error.detach()), full_precision(omega)
-        expected = None if expected is None else full_precision(expected)
         on_hand = hand if hand.dtype == torch.bool else hand > 0.5
         # Off the CPU the question would wait for the device.
         sound = error.device.type == "cpu" and bool(error.sum().isfinite())
@@ -285,37 +274,61 @@ class PerturbationAwareWeights(nn.Module):
         if finite is not None:
             error = torch.where(finite, error, torch.zeros_like(error))
             counted = on_hand & finite
-        means, shares, present = self._measure(error, regions, counted, on_hand)
-        if expected is not None and self.settings.errors == "place":
-            ordinary, _ = _region_means(expected, regions, counted)
+        means, pixels = _region_means(error, regions, counted)
+        shares, present = self._shares(pixels, regions, on_hand), pixels > 0.0
+        errors, scaled = means, self.variant == "scaled"
+        if scaled and expected is None:
+            errors = means / running_median(None, means, present)
+        elif scaled and expected is not None:
+            ordinary, _ = _region_means(full_precision(expected), regions, counted)
             errors = torch.where(
                 present, means / ordinary.clamp(min=LEAST), torch.zeros_like(means)
             )
+        lambdas = self._lambdas(errors, shares)
+        if scaled:
+            most = self.T_E.detach() * (1.0 - self.T_mu.detach())
+            lambdas = lambdas / most.clamp(min=1e-6)
+            weights = regions.spread(lambdas) * hand
         else:
-            errors = self._counted(means, present, median)
-        live = self.temporal_factor(omega)
-        temporal = live.detach()
-        of_regions = temporal if self.settings.temporal in ("all", "regions") else None
-        gates = self._gates(errors, shares)
-        # A region without hand has no error; it must stay out even if T_mu learns to be < 0.
-        lambdas = self.settings.alpha * gates * (shares > 0.0)
-        lambdas = lambdas if of_regions is None else lambdas * of_regions[:, None]
-        weights = regions.spread(lambdas)
-        if self.settings.variant == "scaled":
-            background = torch.zeros_like(error)
-            weights = weights * hand
-        else:
-            background = ~on_hand * torch.relu(self.T_b - _CHANNELS * error)
-            if self.settings.temporal == "all":
-                background = background * temporal[:, None, None]
-            weights = weights + background
+            lambdas = lambdas * self.temporal_factor(omega.detach())[:, None]
+            background = torch.relu(self.T_b - _CHANNELS * error)
+            weights = regions.spread(lambdas) + ~on_hand * background
         if finite is not None:
-            weights, background = weights * finite, background * finite
-        sizes = weights.mean(dim=(1, 2))
-        if self.settings.temporal == "all":
-            # Its value is that of W; its gradient reaches omega.
-            sizes = sizes * (live / temporal)
-        return Weights(weights, background, lambdas, errors, means, shares, temporal, sizes)
+            weights = weights * finite
+        return Weights(weights, lambdas, errors, means, shares)
+
+    def released(
+        self,
+        residual: Tensor,
+        regions: Regions,
+        visible: Tensor,
+        silhouette: Tensor,
+        coverage: Tensor,
+    ) -> Weights:
+        """Weigh B frames as the authors' code does. Gradients reach the rendering, as there.
+
+        Args:
+            residual: (B, H, W, 3) |rendering - input|, of the whole input.
+            regions: y_u of the frames.
+            visible: (B, H, W) bool, y_h.
+            silhouette: (B, H, W) bool, where the posed mesh is, whatever covers it.
+            coverage: (B, H, W) of the rendering.
+
+        Source: what the authors' `train_single.py` and `train_multi.py` do, in code of our own.
+        """
+        low, high = residual.amin(), residual.amax()
+        span = high - low
+        stretched = (residual - low) / torch.where(span > 0.0, span, torch.ones_like(span))
+        error = stretched.mean(dim=-1)
+        errors, pixels = _region_means(error, regions, silhouette)
+        shares = self._shares(pixels, regions, silhouette)
+        lambdas = self._lambdas(errors, shares)
+        # Skin that is drawn behind something counts nothing; what is drawn nowhere is background.
+        seen = visible.sum(dim=(1, 2)).clamp(min=1)
+        background = torch.relu(self.T_b - error.sum(dim=(1, 2)) / seen)[:, None, None]
+        weights = regions.spread(lambdas) * visible
+        weights = weights + (coverage.detach() < DRAWN_FROM) * background
+        return Weights(weights, lambdas, errors, errors, shares)
 
     def temporal_factor(self, omega: Tensor) -> Tensor:
         """1 / (1 + beta |omega|), in (0, 1]; the paper's has no absolute value.
@@ -323,39 +336,24 @@ class PerturbationAwareWeights(nn.Module):
         Args:
             omega: (B,) temporal weights.
         """
-        return 1.0 / (1.0 + self.settings.beta * omega.abs())
+        return 1.0 / (1.0 + self.constants.beta * omega.abs())
 
-    def _gates(self, errors: Tensor, shares: Tensor) -> Tensor:
-        """kappa(T_E - E_u) kappa(mu_u - T_mu), (B, U); `scaled`: at most 1."""
-        found = torch.relu(self.T_E - errors) * torch.relu(shares - self.T_mu)
-        if self.settings.variant != "scaled":
-            return found
-        most = self.T_E.detach() * (1.0 - self.T_mu.detach())
-        return found / most.clamp(min=1e-6)
+    def _lambdas(self, errors: Tensor, shares: Tensor) -> Tensor:
+        """alpha kappa(T_E - E_u) kappa(mu_u - T_mu), (B, U)."""
+        gates = torch.relu(self.T_E - errors) * torch.relu(shares - self.T_mu)
+        # A region without hand has no error; it must stay out even if T_mu learns to be < 0.
+        return self.constants.alpha * gates * (shares > 0.0)
 
-    def _counted(self, means: Tensor, present: Tensor, median: float | Tensor | None) -> Tensor:
-        """E_u in what the settings say, (B, U)."""
-        if self.settings.errors == "batch":
-            return _stretch(means, present)
-        if self.settings.errors == "absolute":
-            return means
-        unit = running_median(None, means, present) if median is None else median
-        return means / unit
-
-    @torch.no_grad()
-    def _measure(
-        self, error: Tensor, regions: Regions, counted: Tensor, on_hand: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """The regions' mean errors, mu_u, and which have any hand, (B, U) each."""
-        errors, pixels = _region_means(error, regions, counted)
+    def _shares(self, pixels: Tensor, regions: Regions, hand: Tensor) -> Tensor:
+        """mu_u of regions that have so many counted pixels of the hand, (B, U)."""
         share_of = self._share_of
         if share_of == "auto":
             share_of = "region" if regions.membership is None else "hand"
         if share_of == "hand":
-            whole = on_hand.flatten(1).sum(dim=1, keepdim=True).to(error)
+            whole = hand.flatten(1).sum(dim=1, keepdim=True).to(pixels)
         else:
-            whole = regions.sizes().to(error)
-        return errors, pixels / whole.clamp(min=1.0), pixels > 0.0
+            whole = regions.sizes().to(pixels)
+        return pixels / whole.clamp(min=1.0)
 
 
 def _region_means(values: Tensor, regions: Regions, counted: Tensor) -> tuple[Tensor, Tensor]:
@@ -365,29 +363,9 @@ def _region_means(values: Tensor, regions: Regions, counted: Tensor) -> tuple[Te
     return regions.sums(values * ones) / pixels.clamp(min=1.0), pixels
 
 
-def binary_weights(hand: Tensor, outside: float = 0.0) -> Tensor:
-    """The hand's mask as weights.
-
-    Args:
-        hand: (B, H, W) y_h: bool, or coverage in [0, 1], hand where above a half.
-
-    Returns:
-        (B, H, W) float32, 1 on the hand.
-    """
-    on_hand = hand if hand.dtype == torch.bool else hand > 0.5
-    return on_hand.float() + outside * (~on_hand).float()
-
-
-def _stretch(errors: Tensor, present: Tensor) -> Tensor:
-    """Errors of the regions that are present, from their smallest to their largest, on [0, 1]."""
-    if not errors.numel():
-        return errors
-    # Without a region that is present the span is minus infinity, and all is 0.
-    low = torch.where(present, errors, math.inf).amin()
-    high = torch.where(present, errors, -math.inf).amax()
-    span = high - low
-    stretched = (errors - low) / torch.where(span > 0.0, span, torch.ones_like(span))
-    return torch.where(present & (span > _EQUAL * high), stretched, torch.zeros_like(errors))
+def binary_weights(hand: Tensor) -> Tensor:
+    """(B, H, W) float32, 1 where y_h, bool or a coverage, is above a half, and 0 elsewhere."""
+    return (hand if hand.dtype == torch.bool else hand > 0.5).float()
 
 
 def _check_shapes(error: Tensor, regions: Regions, hand: Tensor, omega: Tensor) -> None:

@@ -114,14 +114,14 @@ class Regions:
             values: (B, H, W) float.
 
         Returns:
-            (B, U); no gradient.
+            (B, U), differentiable in `values`.
         """
-        index, numbers = self.index.flatten(), values.detach().flatten()
+        index, numbers = self.index.flatten(), values.flatten()
         places = len(self.index) * self.atoms
-        if index.device.type == "cpu":
+        if index.device.type == "cpu" and not numbers.requires_grad:
             total = torch.bincount(index, numbers, minlength=places)
-        else:  # a count would wait for the device
-            total = numbers.new_zeros(places).index_add_(0, index, numbers)
+        else:  # a count has no gradient, and would wait for a device
+            total = numbers.new_zeros(places).index_add(0, index, numbers)
         total = total.reshape(len(self.index), self.atoms)
         if self.membership is None:
             return total

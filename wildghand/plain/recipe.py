@@ -150,8 +150,10 @@ class Recipe(IterativeFit[Avatar], Generic[Settings]):
         raise NotImplementedError
 
     def rates(self) -> dict[str, float]:
-        """Adam's step at the start of each tensor, by name."""
-        raise NotImplementedError
+        """Adam's step at the start of each tensor: of `lamp` and `lamp.left` it is `lamp_rate`."""
+        rates = {name: f"{name.partition('.')[0]}_rate" for name in self.parameters()}
+        settings = vars(self.settings)
+        return {name: settings[rate] for name, rate in rates.items() if rate in settings}
 
     def draw(self, batch: Batch) -> Drawing:
         """Draw the frames of a batch; differentiable. The formation of an image is in here."""
@@ -180,6 +182,13 @@ class Recipe(IterativeFit[Avatar], Generic[Settings]):
     def loss(self, batch: Batch, drawing: Drawing, weights: torch.Tensor) -> torch.Tensor:
         """The scalar that Adam makes small."""
         return photometric_loss(drawing.image, batch.images, weights, self.settings.dssim_weight)
+
+    def outline(self, batch: Batch, drawing: Drawing, weights: torch.Tensor) -> torch.Tensor:
+        """Mean square of the coverage's distance to the mask, for the loss of a subclass.
+
+        Outside, the mask may be what covers the hand: it counts as little as in colours.
+        """
+        return (drawing.coverage[..., 0] * weights - batch.masks * weights).square().mean()
 
     def move_back(self, batch: Batch) -> None:
         """Called after Adam's step; keeps the tensors within their ranges."""
@@ -299,7 +308,7 @@ class PlainRecipe(Recipe[PlainSettings]):
 
     def rates(self) -> dict[str, float]:
         """Adam's step at the start of each tensor, by name."""
-        return learning_rates(self.settings)
+        return {**super().rates(), **learning_rates(self.settings)}
 
     def draw(self, batch: Batch) -> Drawing:
         """Draw the frames of a batch; differentiable. The formation of an image is in here."""

@@ -16,7 +16,6 @@ from hwp_bench.hands.articulation import right_jacobian
 from hwp_bench.hands.poses import turned
 from wildghand.gaussians.found import Found, Kept
 from wildghand.poses.errors import (
-    PoseSettings,
     error_size,
     extent_in,
     in_front,
@@ -82,6 +81,10 @@ def _numbers(pose: np.ndarray, transl: np.ndarray) -> np.ndarray:
     return rows.astype(np.float32) + np.float32(0.0)
 
 
+#: Frames at most from which the spread of poses is learnt, evenly spread over the clip.
+FRAMES = 240
+#: Errors below this, rad (root mean square of finger joints), are left alone.
+LEAST_ERROR = 0.01
 # Joints and numbers of the fingers; the wrist and the place are what is left of 51.
 _FINGERS = slice(3, 48)
 _OTHERS = [0, 1, 2, 48, 49, 50]
@@ -95,7 +98,6 @@ def believed_hands(
     templates: Mapping[str, HandTemplate],
     hands: Mapping[str, HandParameters],
     cameras: Cameras,
-    settings: PoseSettings,
 ) -> dict[str, HandParameters]:
     """Correct the given poses of a clip by what they have in common.
 
@@ -103,16 +105,13 @@ def believed_hands(
     they err is found from the given poses of all frames; no picture is read.
     """
     return {
-        side: _believed(templates[side], hand, cameras.viewmats, settings)
-        for side, hand in hands.items()
+        side: _believed(templates[side], hand, cameras.viewmats) for side, hand in hands.items()
     }
 
 
-def _believed(
-    template: HandTemplate, hand: HandParameters, viewmats: np.ndarray, settings: PoseSettings
-) -> HandParameters:
+def _believed(template: HandTemplate, hand: HandParameters, viewmats: np.ndarray) -> HandParameters:
     valid = np.flatnonzero(hand.valid & in_front(template, hand, viewmats))
-    some = valid[evenly(len(valid), settings.frames)]
+    some = valid[evenly(len(valid), FRAMES)]
     if len(some) <= _FINGERS.stop - _FINGERS.start:
         return hand
     extent = extent_in(template, _rows(hand, valid), viewmats[valid])
@@ -123,7 +122,7 @@ def _believed(
     poses, errors = _in_vectors(_rows(hand, some), covariances(some))
     size = error_size(poses, errors)
     mean_square = np.trace(errors, axis1=1, axis2=2).mean() / errors.shape[1]
-    if size * np.sqrt(mean_square) < settings.least_error:
+    if size * np.sqrt(mean_square) < LEAST_ERROR:
         return hand
     spread = spread_of(poses, size**2 * errors, _ROUNDS)
     pose, transl = hand.pose.copy(), hand.transl.copy()

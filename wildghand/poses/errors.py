@@ -21,20 +21,6 @@ from hwp_bench.hands.poses import (
     posed_skeleton,
     rest_skeleton,
 )
-from hwp_bench.methods.settings import number
-
-
-@dataclass(frozen=True)
-class PoseSettings:
-    """How far given poses are drawn to what the clip's other poses say of them."""
-
-    #: Correct the given poses of the clip before the fit.
-    enabled: bool = True
-    #: Frames at most from which the spread of poses is learnt, evenly spread over the clip.
-    frames: int = number(240, 3, 10_000)
-    #: Errors below this, rad (root mean square of finger joints), are left alone.
-    least_error: float = number(0.01, 0.0, 10.0)
-
 
 # Error of a landmark in the image, as a share of the hand's extent, and in space against the hand's
 # centre, along each axis, m. They state the form of the poses' errors, not their size.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from types import MappingProxyType
 from typing import ClassVar
 
@@ -26,9 +26,6 @@ class PrepassSettings:
     #: Least weight of a frame in the fit.
     weight_floor: float = number(0.2, 0.0, 1.0)
 
-    #: Validation frames, which are clean, raise the tolerance to the median of what is found
-    #: against them.
-    validated: ClassVar[bool] = True
     #: Least misplacement that counts as one deviation, share of the hand's size: what rounding to
     #: pixels leaves in frames whose poses are true.
     misplacement_floor: ClassVar[float] = 0.0006
@@ -118,29 +115,21 @@ def neutral_assessment(
     indices: np.ndarray, usable: np.ndarray, size: tuple[int, int]
 ) -> FrameAssessment:
     """Call every usable frame, (R,) bool, clean, because there is too little to compare."""
-    count = len(indices)
-    good = usable.astype(np.float64)
-    zeros = np.zeros(count)
+    zeros, good = np.zeros(len(indices)), usable.astype(np.float64)
+    nothing = {item.name: zeros for item in fields(FrameAssessment)}
     return FrameAssessment(
-        indices=indices,
-        usable=usable,
-        clean=good,
-        frame_weights=np.ones(count),
-        omega_dropout=good,
-        refine_pose=np.zeros(count, dtype=bool),
-        log_gains=np.zeros((count, 3)),
-        gain_deviation=zeros,
-        residual=zeros,
-        residual_deviation=zeros,
-        sharpness=np.ones(count),
-        blur_deviation=zeros,
-        blur_extent=zeros,
-        misplacement=zeros,
-        misplacement_deviation=zeros,
-        hidden=zeros,
-        hidden_deviation=zeros,
-        motion=zeros,
-        pixel_weights=np.full((count, *size), 255, dtype=np.uint8),
+        **nothing
+        | {
+            "indices": indices,
+            "usable": usable,
+            "clean": good,
+            "omega_dropout": good,
+            "frame_weights": np.ones(len(indices)),
+            "sharpness": np.ones(len(indices)),
+            "refine_pose": np.zeros(len(indices), dtype=bool),
+            "log_gains": np.zeros((len(indices), 3)),
+            "pixel_weights": np.full((len(indices), *size), 255, dtype=np.uint8),
+        }
     )
 
 

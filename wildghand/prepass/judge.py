@@ -8,13 +8,13 @@ measurements again with that verdict, and the weights of pixels (`weights`).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from hwp_bench.base.errors import BadInput
-from hwp_bench.hands.anchors import Footprint, HandSurfaces
+from hwp_bench.hands.anchors import HandSurfaces
 from wildghand.prepass.assessment import (
     CLEAN_FROM,
     CLEAN_SHARE,
@@ -28,7 +28,6 @@ from wildghand.prepass.assessment import (
 )
 from wildghand.prepass.intensity import (
     LOWEST,
-    IntensityModel,
     IntensitySamples,
     Verdict,
     fit_intensity,
@@ -37,13 +36,11 @@ from wildghand.prepass.intensity import (
 )
 from wildghand.prepass.measurements import (
     LEAST_PIXELS,
+    Frame,
     FrameMeasurements,
     PrepassInput,
-    ShownCells,
-    border_width,
-    inner_pixels,
     measure_frame,
-    misplacement,
+    shown_cells,
 )
 from wildghand.prepass.weights import weigh_pixels
 
@@ -78,11 +75,7 @@ def classify_frames(
     settings: PrepassSettings,
     tolerance: float,
 ) -> FrameAssessment:
-    """Compare the frames with each other and assess them; every pixel has full weight.
-
-    Args:
-        indices: (R,) ascending frame numbers.
-    """
+    """Compare (R,) frames of ascending numbers and assess them; every pixel has full weight."""
     count = len(indices)
     rows = np.array(sorted(measured))
     usable = np.zeros(count, dtype=bool)
@@ -94,14 +87,13 @@ def classify_frames(
         return result
 
     found = [measured[row] for row in rows.tolist()]
-    cues = _compare(found)
-    found_evidence = evidence(cues.deviations, indices[rows], settings.tolerance)
-    clean = spread(clean_probability(found_evidence, tolerance))
+    gains, off = _compare(found)
+    against = evidence([*off.values()], indices[rows], settings.tolerance)
+    clean = spread(clean_probability(against, tolerance))
     border, texture = _gathered(found, "border"), _gathered(found, "texture")
     sharp_border = float(np.exp(normal_value(np.log(border), CLEAN_SHARE)[0]))
     extent = np.sqrt(np.maximum(np.nan_to_num(border) ** 2 - sharp_border**2, 0.0))
-    clear = _CLEAR
-    refine = (cues.misplacement > clear) & (cues.border < clear)
+    refine = (off["misplacement"] > _CLEAR) & (off["border"] < _CLEAR)
     return FrameAssessment(
         indices=indices,
         usable=usable,
@@ -109,17 +101,17 @@ def classify_frames(
         frame_weights=settings.weight_floor + (1.0 - settings.weight_floor) * clean,
         omega_dropout=np.where(clean >= CLEAN_FROM, 1.0, 0.0),
         refine_pose=spread(refine.astype(np.float64)) > 0.5,
-        log_gains=spread(cues.gains),
-        gain_deviation=spread(cues.gain),
+        log_gains=spread(gains),
+        gain_deviation=spread(off["gain"]),
         residual=spread(_gathered(found, "level")),
-        residual_deviation=spread(cues.level),
+        residual_deviation=spread(off["level"]),
         sharpness=spread(np.nan_to_num(texture, nan=1.0), missing=1.0),
-        blur_deviation=spread(np.maximum(cues.border, cues.texture)),
+        blur_deviation=spread(np.maximum(off["border"], off["texture"])),
         blur_extent=spread(extent),
         misplacement=spread(_gathered(found, "misplacement")),
-        misplacement_deviation=spread(cues.misplacement),
+        misplacement_deviation=spread(off["misplacement"]),
         hidden=spread(_gathered(found, "hidden")),
-        hidden_deviation=spread(cues.hidden),
+        hidden_deviation=spread(off["hidden"]),
         motion=spread(_gathered(found, "motion")),
         pixel_weights=np.full((count, *size), 255, dtype=np.uint8),
     )
@@ -140,54 +132,31 @@ def clip_tolerance(found: np.ndarray, least: float) -> float:
     return max(least, float(np.median(found)))
 
 
-def evidence_against(
-    indices: np.ndarray, measured: Sequence[FrameMeasurements], tolerance: float
-) -> np.ndarray:
-    """Compare R frames with each other; returns what speaks against each, (R,), not negative."""
-    return evidence(_compare(measured).deviations, indices, tolerance)
-
-
-@dataclass(frozen=True, eq=False)
-class _Cues:
-    """R frames compared with each other: how far each is off, one-sided, in robust deviations."""
-
-    #: (R, 3) log gains, relative to their mode.
-    gains: np.ndarray
-    #: (R,) each.
-    gain: np.ndarray
-    level: np.ndarray
-    texture: np.ndarray
-    border: np.ndarray
-    misplacement: np.ndarray
-    hidden: np.ndarray
-
-    @property
-    def deviations(self) -> tuple[np.ndarray, ...]:
-        """All that speaks against a frame, (R,) each."""
-        place = (self.misplacement, self.hidden)
-        return (self.gain, self.level, self.texture, self.border, *place)
-
-
 def _gathered(found: Sequence[FrameMeasurements], name: str) -> np.ndarray:
     """A measurement of all frames, (R, ...)."""
     return np.array([getattr(one, name) for one in found], dtype=np.float64)
 
 
-def _compare(found: Sequence[FrameMeasurements]) -> _Cues:
-    share = CLEAN_SHARE
+def _compare(found: Sequence[FrameMeasurements]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Compare R frames with each other.
+
+    Returns:
+        (R, 3) log gains, relative to their mode, and by cue how far each frame is off, (R,),
+        one-sided, in robust deviations: all that speaks against it.
+    """
     gains = _gathered(found, "gain")
-    gains = gains - densest(gains, share)[0]
-    level = np.log(np.maximum(_gathered(found, "level"), 1e-4))
-    misplaced, hidden = _gathered(found, "misplacement"), _gathered(found, "hidden")
-    return _Cues(
-        gains=gains,
-        gain=excess(np.linalg.norm(gains, axis=1), share, _GAIN_FLOOR),
-        level=excess(level, share, _RESIDUAL_FLOOR),
-        texture=excess(-_gathered(found, "texture"), share, _TEXTURE_FLOOR),
-        border=excess(np.log(_gathered(found, "border")), share, _BORDER_FLOOR),
-        misplacement=excess(misplaced, share, PrepassSettings.misplacement_floor),
-        hidden=excess(hidden, share, _HIDDEN_FLOOR),
-    )
+    gains = gains - densest(gains, CLEAN_SHARE)[0]
+    cues = {
+        "gain": (np.linalg.norm(gains, axis=1), _GAIN_FLOOR),
+        "level": (np.log(np.maximum(_gathered(found, "level"), 1e-4)), _RESIDUAL_FLOOR),
+        "texture": (-_gathered(found, "texture"), _TEXTURE_FLOOR),
+        "border": (np.log(_gathered(found, "border")), _BORDER_FLOOR),
+        "misplacement": (_gathered(found, "misplacement"), PrepassSettings.misplacement_floor),
+        "hidden": (_gathered(found, "hidden"), _HIDDEN_FLOOR),
+    }
+    return gains, {
+        name: excess(values, CLEAN_SHARE, floor) for name, (values, floor) in cues.items()
+    }
 
 
 def evidence(deviations: Sequence[np.ndarray], indices: np.ndarray, tolerance: float) -> np.ndarray:
@@ -243,100 +212,56 @@ def _judge(
     given: PrepassInput, settings: PrepassSettings, known_clean: PrepassInput | None
 ) -> FrameAssessment:
     surfaces = HandSurfaces(given.templates, PATCH_SIZE)
-    usable = _measurable(given)
-    drawn = list(_footprints(given, surfaces, usable))
-    survey = _survey(given, drawn, len(surfaces.cell_normals))
-    usable = survey.readable
-    if not usable.any():
+    cell_normals = surfaces.cell_normals
+    drawn = _draw(given, surfaces)
+    frames = _readable(drawn)
+    if not frames:
         flat = sum(_is_flat(image) for image in given.images)
         raise BadInput(
-            f"none of {len(usable)} training frames shows a hand where the parameters place one"
-            + (f"; {flat} of them are black or of one colour" if flat else ""),
+            f"none of {len(given.indices)} training frames shows a hand where the parameters place "
+            "one" + (f"; {flat} of them are black or of one colour" if flat else ""),
             remedy="Check the capture with `hwp-bench data show`.",
         )
-    if usable.sum() < LEAST_FRAMES:
+    usable = np.isin(np.arange(len(given.indices)), list(frames))
+    if len(frames) < LEAST_FRAMES:
         return neutral_assessment(given.indices, usable, given.size)
-    drawn = [(row, footprint) for row, footprint in drawn if usable[row]]
-    cell_normals = surfaces.cell_normals
-    model = fit_intensity(survey.samples, cell_normals)
-    measured = _measured(given, survey, model, drawn)
+    quota = max(16, SAMPLE_COUNT // len(drawn))
+    samples = _intensity_samples([*frames.values()], quota)
+    shown = shown_cells(frames.values(), len(cell_normals))
+    model = fit_intensity(samples, cell_normals)
+    measured = {row: measure_frame(model, frame, shown) for row, frame in frames.items()}
     tolerance = settings.tolerance
     if known_clean is not None:
-        clean = _measured_alike(known_clean, surfaces, survey, model)
-        tolerance = _tolerance(given, measured, known_clean, clean, settings)
+        known = _readable(_draw(known_clean, surfaces))
+        found = [measure_frame(model, frame, shown) for frame in known.values()]
+        indices = np.concatenate([given.indices[usable], known_clean.indices[[*known]]])
+        off = _compare([*measured.values(), *found])[1]
+        against = evidence([*off.values()], indices, tolerance)
+        tolerance = clip_tolerance(against[len(measured) :], tolerance)
     judged = classify_frames(given.indices, given.size, measured, settings, tolerance)
     # Pixels are compared with what clean frames show, which is known only now.
     verdict = Verdict(judged.clean[usable], model.gains)
-    model = fit_intensity(survey.samples, cell_normals, verdict)
-    measured = _measured(given, survey, model, drawn)
+    model = fit_intensity(samples, cell_normals, verdict)
+    measured = {row: measure_frame(model, frame, shown) for row, frame in frames.items()}
     weights = weigh_pixels(given.masks, measured, judged.clean, model.known)
     return replace(judged, pixel_weights=weights)
 
 
-@dataclass(frozen=True, eq=False)
-class _Survey:
-    """The result of a first pass over all frames."""
-
-    samples: IntensitySamples
-    shown: ShownCells
-    #: (R,) bool: the hands are in the image, where the mask has them, and can be read.
-    readable: np.ndarray
-    #: (R,) `misplacement` and `border_width`; NaN in frames that are not readable.
-    misplacement: np.ndarray
-    border: np.ndarray
-    #: (R,) px.
-    motion: np.ndarray
-
-
-def _measured(
-    given: PrepassInput,
-    survey: _Survey,
-    model: IntensityModel,
-    drawn: Sequence[tuple[int, Footprint]],
-) -> dict[int, FrameMeasurements]:
-    """Compare each of the drawn frames, by row, with the model."""
+def _draw(given: PrepassInput, surfaces: HandSurfaces) -> dict[int, Frame]:
+    """Draw the hands of frames that can be measured, by row."""
+    rows = np.flatnonzero(_measurable(given))
+    drawn = surfaces.footprints(
+        given.hands, given.cameras.Ks, given.cameras.viewmats, given.indices[rows], given.size
+    )
     return {
-        row: measure_frame(
-            model,
-            footprint,
-            given.images[row],
-            given.masks[row],
-            shown=survey.shown,
-            misplacement=float(survey.misplacement[row]),
-            border=float(survey.border[row]),
-            motion=float(survey.motion[row]),
-        )
-        for row, footprint in drawn
+        row: Frame(footprint, given.images[row], given.masks[row])
+        for row, footprint in zip(rows.tolist(), drawn, strict=True)
     }
 
 
-def _measured_alike(
-    known: PrepassInput,
-    surfaces: HandSurfaces,
-    survey: _Survey,
-    model: IntensityModel,
-) -> dict[int, FrameMeasurements]:
-    """Compare other frames of the clip, by row, with the model, which was made without them."""
-    drawn = list(_footprints(known, surfaces, _measurable(known)))
-    own = _survey(known, drawn, len(surfaces.cell_normals))
-    readable = [(row, footprint) for row, footprint in drawn if own.readable[row]]
-    return _measured(known, replace(own, shown=survey.shown), model, readable)
-
-
-def _tolerance(
-    given: PrepassInput,
-    measured: dict[int, FrameMeasurements],
-    known_clean: PrepassInput,
-    clean: dict[int, FrameMeasurements],
-    settings: PrepassSettings,
-) -> float:
-    """The tolerance of the clip, from measurements of its frames and of those that are clean."""
-    rows, known = sorted(measured), sorted(clean)
-    indices = np.concatenate([given.indices[rows], known_clean.indices[known]])
-    found = [measured[row] for row in rows] + [clean[row] for row in known]
-    return clip_tolerance(
-        evidence_against(indices, found, settings.tolerance)[len(rows) :], settings.tolerance
-    )
+def _readable(drawn: Mapping[int, Frame]) -> dict[int, Frame]:
+    """The frames whose hands are in the image, where the mask has them, and can be read."""
+    return {row: one for row, one in drawn.items() if one.inner.sum() >= LEAST_PIXELS}
 
 
 def _measurable(given: PrepassInput) -> np.ndarray:
@@ -358,54 +283,20 @@ def _is_flat(image: np.ndarray) -> bool:
     return int(pixels.max()) < LOWEST or bool((pixels == pixels[0]).all())
 
 
-def _footprints(
-    given: PrepassInput, surfaces: HandSurfaces, usable: np.ndarray
-) -> Iterator[tuple[int, Footprint]]:
-    rows = np.flatnonzero(usable)
-    drawn = surfaces.footprints(
-        given.hands, given.cameras.Ks, given.cameras.viewmats, given.indices[rows], given.size
-    )
-    return zip(rows.tolist(), drawn, strict=True)
-
-
-def _survey(
-    given: PrepassInput,
-    drawn: Sequence[tuple[int, Footprint]],
-    cell_count: int,
-) -> _Survey:
-    count = len(given.indices)
+def _intensity_samples(frames: Sequence[Frame], quota: int) -> IntensitySamples:
+    """The pixels from which the intensity model is fitted, at most so many of each frame."""
     table = log_light_table()
-    quota = max(16, SAMPLE_COUNT // max(len(drawn), 1))
-    shown = ShownCells(cell_count)
-    off, border = np.full(count, np.nan), np.full(count, np.nan)
-    motion, sizes = np.zeros(count), np.zeros(count, dtype=np.int64)
     cells, light, normals = [], [], []
-    for row, footprint in drawn:
-        motion[row] = footprint.motion
-        masked = given.masks[row] > 127
-        values = given.images[row].reshape(-1, 3)[footprint.pixels]
-        chosen = np.flatnonzero(inner_pixels(footprint, masked, values))
-        if len(chosen) < LEAST_PIXELS:
-            continue
-        shown.add(footprint.cells, masked.reshape(-1)[footprint.pixels])
-        off[row] = misplacement(masked, footprint.silhouette)
-        border[row] = border_width(given.images[row], masked)
+    for frame in frames:
+        chosen = np.flatnonzero(frame.inner)
         if len(chosen) > quota:
             chosen = chosen[np.linspace(0, len(chosen) - 1, quota).astype(np.int64)]
-        sizes[row] = len(chosen)
-        cells.append(footprint.cells[chosen].astype(np.int64))
-        light.append(table[values[chosen]])
-        normals.append(footprint.normals[chosen])
-    return _Survey(
-        samples=IntensitySamples(
-            starts=np.concatenate([[0], np.cumsum(sizes[sizes > 0])]),
-            cells=np.concatenate([np.empty(0, dtype=np.int64), *cells]),
-            light=np.concatenate([np.empty((0, 3), dtype=np.float32), *light]),
-            basis=shading_basis(np.concatenate([np.empty((0, 3), dtype=np.float32), *normals])),
-        ),
-        shown=shown,
-        readable=sizes > 0,
-        misplacement=off,
-        border=border,
-        motion=motion,
+        cells.append(frame.footprint.cells[chosen].astype(np.int64))
+        light.append(table[frame.values[chosen]])
+        normals.append(frame.footprint.normals[chosen])
+    return IntensitySamples(
+        starts=np.cumsum([0, *map(len, cells)]),
+        cells=np.concatenate(cells),
+        light=np.concatenate(light),
+        basis=shading_basis(np.concatenate(normals)),
     )

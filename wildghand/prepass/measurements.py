@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
@@ -178,28 +179,6 @@ def misplacement(mask: np.ndarray, silhouette: np.ndarray) -> float:
     return outside / max(ring, 1.0) / float(np.sqrt(np.count_nonzero(silhouette)))
 
 
-class ShownCells:
-    """How often each cell of the surface is in the mask when it is in the silhouette.
-
-    A cell that no mask shows (the wrist inside a sleeve) does not count as hidden.
-    """
-
-    def __init__(self, cell_count: int) -> None:
-        self._drawn = np.zeros(cell_count, dtype=np.int64)
-        self._shown = np.zeros(cell_count, dtype=np.int64)
-
-    def add(self, cells: np.ndarray, masked: np.ndarray) -> None:
-        """Count one frame: (P,) cells of its pixels and (P,) bool whether the mask has them."""
-        self._drawn += np.bincount(cells, minlength=len(self._drawn))
-        self._shown += np.bincount(cells[masked], minlength=len(self._drawn))
-
-    def hidden_share(self, cells: np.ndarray, masked: np.ndarray) -> float:
-        """Share of a frame's pixels that other frames show and its mask lacks."""
-        known = 2 * self._shown[cells] > self._drawn[cells]
-        lacking = int(np.count_nonzero(known & ~masked))
-        return lacking / max(int(np.count_nonzero(known)), 1)
-
-
 def interior(area: np.ndarray, margin: int) -> np.ndarray:
     """(H, W) bool: the pixels of an area that lie more than `margin` px inside; 1 at least."""
     shape = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * margin + 1, 2 * margin + 1))
@@ -281,30 +260,72 @@ class FrameMeasurements:
     motion: float
 
 
-def measure_frame(
-    model: IntensityModel,
-    footprint: Footprint,
-    image: np.ndarray,
-    mask: np.ndarray,
-    *,
-    shown: ShownCells,
-    misplacement: float,
-    border: float,
-    motion: float,
-) -> FrameMeasurements:
-    """Compare a frame with the intensity model.
+@dataclass(eq=False)
+class Frame:
+    """A frame in which hands are drawn where its parameters place them."""
 
-    Args:
-        image: (H, W, 3) uint8 sRGB.
-        mask: (H, W) uint8, 255 = visible hand.
-        border: width of its border, px.
-        motion: since the frame before, px.
+    #: Of the hands: P pixels.
+    footprint: Footprint
+    #: (H, W, 3) uint8 sRGB.
+    image: np.ndarray
+    #: (H, W) uint8, 255 = visible hand.
+    mask: np.ndarray
+
+    @property
+    def masked(self) -> np.ndarray:
+        """(H, W) bool, visible hand."""
+        return np.asarray(self.mask > 127)
+
+    @property
+    def values(self) -> np.ndarray:
+        """(P, 3) uint8 sRGB."""
+        return self.image.reshape(-1, 3)[self.footprint.pixels]
+
+    @functools.cached_property
+    def inner(self) -> np.ndarray:
+        """(P,) bool: the pixels that should show skin in a known place and can be read.
+
+        They lie well inside silhouette and mask, seen from the front, neither dark nor clipped.
+        """
+        inside = interior(self.footprint.silhouette, _MARGIN) & interior(self.masked, _MARGIN)
+        return np.asarray(
+            inside.reshape(-1)[self.footprint.pixels]
+            & (self.footprint.facing > _FACING)
+            & ((self.values >= LOWEST) & (self.values <= HIGHEST)).all(axis=1)
+        )
+
+    @functools.cached_property
+    def misplacement(self) -> float:
+        """See `misplacement`."""
+        return misplacement(self.masked, self.footprint.silhouette)
+
+    @functools.cached_property
+    def border(self) -> float:
+        """See `border_width`."""
+        return border_width(self.image, self.masked)
+
+
+def shown_cells(frames: Iterable[Frame], cell_count: int) -> np.ndarray:
+    """(C,) bool: the cells that masks have in most frames in which the silhouette has them.
+
+    A cell that no mask shows (the wrist inside a sleeve) does not count as hidden.
     """
-    table = log_light_table()
-    values = image.reshape(-1, 3)[footprint.pixels]
-    light, masked = table[values], mask > 127
-    inner = inner_pixels(footprint, masked, values)
-    beyond = np.flatnonzero((mask > 0) & ~footprint.silhouette)
+    drawn, shown = np.zeros(cell_count, dtype=np.int64), np.zeros(cell_count, dtype=np.int64)
+    for frame in frames:
+        cells = frame.footprint.cells
+        drawn += np.bincount(cells, minlength=cell_count)
+        masked = frame.masked.reshape(-1)[frame.footprint.pixels]
+        shown += np.bincount(cells[masked], minlength=cell_count)
+    return np.asarray(2 * shown > drawn)
+
+
+def measure_frame(model: IntensityModel, frame: Frame, shown: np.ndarray) -> FrameMeasurements:
+    """Compare a frame with the intensity model; `shown` is that of `shown_cells`."""
+    table, footprint, inner = log_light_table(), frame.footprint, frame.inner
+    light = table[frame.values]
+    beyond = np.flatnonzero((frame.mask > 0) & ~footprint.silhouette)
+    known_cells = shown[footprint.cells]
+    lacking = known_cells & ~frame.masked.reshape(-1)[footprint.pixels]
 
     expected = model.predict(footprint.cells, footprint.normals)
     rest = light - expected
@@ -312,7 +333,7 @@ def measure_frame(
     residual = channel_mean(np.abs(rest - gain.astype(np.float32)))
     skin = model.skin[footprint.cells]
     tint = _tint(light - skin - gain)
-    colours = table[image.reshape(-1, 3)[beyond]] - gain
+    colours = table[frame.image.reshape(-1, 3)[beyond]] - gain
     tint_beyond = _tint(colours - np.median(skin, axis=0))
     if model.second is not None:
         # A place that no clean frame shows has one of the hand's colours, and nobody knows which.
@@ -337,28 +358,10 @@ def measure_frame(
             footprint.pixels[inner],
             footprint.silhouette.shape,
         ),
-        hidden=shown.hidden_share(footprint.cells, masked.reshape(-1)[footprint.pixels]),
-        misplacement=misplacement,
-        border=border,
-        motion=motion,
-    )
-
-
-def inner_pixels(footprint: Footprint, masked: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """The pixels that should show skin in a known place and can be read.
-
-    Args:
-        masked: (H, W) bool, visible hand.
-        values: (P, 3) uint8 sRGB.
-
-    Returns:
-        (P,) bool: well inside silhouette and mask, seen from the front, neither dark nor clipped.
-    """
-    inside = interior(footprint.silhouette, _MARGIN) & interior(masked, _MARGIN)
-    return (
-        inside.reshape(-1)[footprint.pixels]
-        & (footprint.facing > _FACING)
-        & ((values >= LOWEST) & (values <= HIGHEST)).all(axis=1)
+        hidden=int(np.count_nonzero(lacking)) / max(int(np.count_nonzero(known_cells)), 1),
+        misplacement=frame.misplacement,
+        border=frame.border,
+        motion=footprint.motion,
     )
 
 

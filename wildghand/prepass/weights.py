@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import cv2
 import numpy as np
@@ -61,13 +61,12 @@ def weigh_pixels(
     level, tint_level = (
         max(normal_value(values, CLEAN_SHARE)[0], _LEAST_LEVEL) for values in (levels, tint_levels)
     )
-    prior = _PRIOR
     # Where clean frames all fit badly, the larger of both means is what is normal.
     normal = np.maximum(
-        normal_residuals(residuals, cells, trusts, cell_count, level, prior),
-        geometric_normals(residuals, cells, trusts, cell_count, level, prior),
+        normal_residuals(residuals, cells, trusts, cell_count, level),
+        geometric_normals(residuals, cells, trusts, cell_count, level),
     )
-    normal_tint = geometric_normals(tints, cells, trusts, cell_count, tint_level, prior)
+    normal_tint = geometric_normals(tints, cells, trusts, cell_count, tint_level)
     weights = np.full(masks.shape, 255, dtype=np.uint8)
     for row, one in measured.items():
         seen = masks[row].reshape(-1) / 255.0
@@ -96,28 +95,20 @@ def normal_residuals(
     trusts: Sequence[float],
     cell_count: int,
     level: float,
-    prior: float,
 ) -> np.ndarray:
-    """Residual of each cell of the surface in clean frames.
+    """(C,) float32 residual of each cell of the surface in clean frames, at least the level.
 
     Nails, creases and places in shadow fit worse than the rest in every frame, which is not a
     sign of a perturbation. Residuals are clipped at five times the level, so that one frame with
     an object does not raise the normal residual of a place.
 
     Args:
-        residuals: for each frame (P,) residuals.
-        cells: for each frame (P,) cells.
+        residuals, cells: (P,) for each frame.
         trusts: for each frame how much it counts, in [0, 1].
-
-    Returns:
-        (C,) float32, at least the level.
     """
-    sums, mass = np.zeros(cell_count), np.zeros(cell_count)
-    for residual, cell, trust in zip(residuals, cells, trusts, strict=True):
-        clipped = np.minimum(residual, 5.0 * level)
-        sums += trust * np.bincount(cell, clipped, minlength=cell_count)
-        mass += trust * np.bincount(cell, minlength=cell_count)
-    return np.maximum((sums + prior * level) / (mass + prior), level).astype(np.float32)
+    clipped = (np.minimum(residual, 5.0 * level) for residual in residuals)
+    sums, mass = _sums(clipped, cells, trusts, np.zeros(cell_count))
+    return np.maximum((sums + _PRIOR * level) / (mass + _PRIOR), level).astype(np.float32)
 
 
 def geometric_normals(
@@ -126,27 +117,30 @@ def geometric_normals(
     trusts: Sequence[float],
     cell_count: int,
     level: float,
-    prior: float,
 ) -> np.ndarray:
-    """Distance of each cell of the surface from what is expected of it, in clean frames.
+    """(C,) float32 distance of each cell from what is expected of it, in clean frames.
 
     Nails and tattoos are far from the skin's tint in every frame, a place under an object in some.
-    The mean is geometric: the first it follows all the way, the second hardly moves it.
-
-    Args:
-        distances: for each frame (P,) distances, of tint or residuals.
-        cells: for each frame (P,) cells.
-        trusts: for each frame how much it counts, in [0, 1].
-
-    Returns:
-        (C,) float32, at least the level.
+    The mean is geometric: the first it follows all the way, the second hardly moves it. It is at
+    least the level. Arguments are those of `normal_residuals`.
     """
-    sums, mass = np.zeros(cell_count), np.full(cell_count, prior)
-    for distance, cell, trust in zip(distances, cells, trusts, strict=True):
-        above = np.log(np.maximum(distance, level) / level)
-        sums += trust * np.bincount(cell, above, minlength=cell_count)
-        mass += trust * np.bincount(cell, minlength=cell_count)
+    above = (np.log(np.maximum(distance, level) / level) for distance in distances)
+    sums, mass = _sums(above, cells, trusts, np.full(cell_count, _PRIOR))
     return (level * np.exp(sums / mass)).astype(np.float32)
+
+
+def _sums(
+    several: Iterable[np.ndarray],
+    cells: Sequence[np.ndarray],
+    trusts: Sequence[float],
+    mass: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Weighted sums of values in (C,) cells, and the weights, which are added to `mass`."""
+    sums = np.zeros(len(mass))
+    for values, cell, trust in zip(several, cells, trusts, strict=True):
+        sums += trust * np.bincount(cell, values, minlength=len(mass))
+        mass = mass + trust * np.bincount(cell, minlength=len(mass))
+    return sums, mass
 
 
 def _sureness(clean: float) -> float:

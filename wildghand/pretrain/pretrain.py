@@ -16,15 +16,15 @@ import torch
 from torch import Tensor
 
 from hwp_bench.base.errors import UsageError
-from hwp_bench.base.files import sha256_file, sha256_json
+from hwp_bench.base.files import sha256_json
 from hwp_bench.base.folders import exclusive
 from hwp_bench.capture import Capture, open_capture
-from hwp_bench.methods.contract import REQUEST, Avatar, Budget, RunSettings, TrainingCapture
+from hwp_bench.methods.contract import Avatar, Budget, RunSettings, TrainingCapture
 from hwp_bench.methods.request import open_request, write_request
 from wildghand.fitting.components import make_fit
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.method import ready_fit
-from wildghand.fitting.session import STATE, every_frame, run_resumed
+from wildghand.fitting.session import STATE, digest_of_request, every_frame, run_resumed
 from wildghand.gaussians.fit_loop import Loss, batches
 from wildghand.model.settings import WildGHandSettings, read_settings
 from wildghand.network import PredictionNetwork
@@ -67,11 +67,10 @@ def pretrain(
         **_RATES,
         **settings,
     }
-    chosen = read_settings(settings)
     captures = [open_capture(source) for source in sources]
     _check_captures(captures)
-    total = chosen.schedule.steps * len(captures) if steps is None else steps
-    run = RunSettings(dict(settings), seed, Budget(steps=total))
+    chosen = read_settings(settings)
+    run = RunSettings(dict(settings), seed, Budget(steps=steps))
     work = out.with_name(out.name + ".pretrain")
     with exclusive(work):
         weights, done = _fit_in(work, captures, run, chosen)
@@ -97,12 +96,7 @@ def _fit_in(
         write_request(work / f"request-{index}", capture, every_frame(capture), run)
         for index, capture in enumerate(captures)
     ]
-    digest = sha256_json(
-        [
-            [sha256_file(request / REQUEST), capture.info.to_json().get("digests")]
-            for request, capture in zip(requests, captures, strict=True)
-        ]
-    )
+    digest = sha256_json([*map(digest_of_request, requests, captures)])
     trainings = [open_request(request) for request in requests]
     joint = JointFit(trainings, chosen, run.seed, ready_fit(chosen.device))
     title = f"Pretraining on {len(captures)} captures"
@@ -187,9 +181,9 @@ class JointFit(IterativeFit[tuple[dict[str, Tensor], int]]):
 
     def batches(self) -> Iterator[tuple[int, Tensor]]:
         """Which capture the next step is taken on, and on which of its frames."""
-        size, seed = self.settings.schedule.batch, self.fits[0].seed
+        seed = self.fits[0].seed
         rows = [
-            batches(len(fit.data.frames), size, seed + 1 + index)
+            batches(len(fit.data.frames), fit.batch, seed + 1 + index)
             for index, fit in enumerate(self.fits)
         ]
         for capture in batches(len(self.fits), 1, seed):
@@ -216,14 +210,14 @@ class JointFit(IterativeFit[tuple[dict[str, Tensor], int]]):
         """A copy of all models that the fit no longer changes; shared weights are in it once."""
         return {name: value.detach().clone() for name, value in self._tensors().items()}
 
+    @torch.no_grad()
     def restore(self, values: dict[str, Tensor]) -> None:
         """Bring the models back to a snapshot."""
         current = self._tensors()
         if values.keys() != current.keys():
             raise ValueError("tensors of other models")
-        with torch.no_grad():
-            for name, value in values.items():
-                current[name].copy_(value)
+        for name, value in values.items():
+            current[name].copy_(value)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that steps change, for `load_state_dict`."""

@@ -117,6 +117,10 @@ _SHIPPED_FOLDER = "priors/compact"
 _SIDES = ("right", "left")
 
 
+class OtherKind(BadInput):
+    """A prior is sound but of another kind than the fit."""
+
+
 def choose_prior(
     settings: WildGHandSettings, hand_model: HandModelId, network: PredictionNetwork | None = None
 ) -> Prior | None:
@@ -127,16 +131,14 @@ def choose_prior(
     """
     if not settings.prior:
         return None
-    if settings.prior != SHIPPED:
-        path = find_prior(settings.prior)
-        return load_prior(path, settings.network.build(), hand_model, network)
-    root = find_prior(_SHIPPED_FOLDER)
-    record = _read_record(root)
+    shipped = settings.prior == SHIPPED
+    root = find_prior(_SHIPPED_FOLDER if shipped else settings.prior)
     try:
-        _check_fit(record, settings.network.build(), hand_model, str(root))
-    except BadInput:
-        return None
-    return _read_prior(root, record, settings.network.build(), network)
+        return load_prior(root, settings.network.build(), hand_model, network)
+    except OtherKind:
+        if shipped:
+            return None
+        raise
 
 
 def find_prior(text: str) -> Path:
@@ -206,29 +208,24 @@ def load_prior(
     network: PredictionNetwork | None = None,
 ) -> Prior:
     """Read a prior; nothing in it is executed."""
-    root = Path(path)
-    record = _read_record(root)
-    _check_fit(record, settings, hand_model, str(root / DESCRIPTION))
-    return _read_prior(root, record, settings, network)
+    root, where = Path(path), str(Path(path) / DESCRIPTION)
+    record = parse_record(PriorRecord, read_json(where), where=where, error=BadInput)
+    _check_record(record, where)
+    _check_fit(record, settings, hand_model, where)
+    shapes = shapes_of_settings(settings) if network is None else shapes_of(network)
+    return Prior(record, _read_weights(root / WEIGHTS, record, shapes))
 
 
-def _read_record(root: Path) -> PriorRecord:
-    where = str(root / DESCRIPTION)
-    description = read_json(root / DESCRIPTION)
-    record = parse_record(PriorRecord, description, where=where, error=BadInput)
+def _check_record(record: PriorRecord, where: str) -> None:
+    if record.schema != SCHEMA:
+        problem = f"is {record.schema[:40]!r} where {SCHEMA!r} is read"
+        raise BadInput(problem, where=where, field="schema")
+    if not record.sides or record.sides != [side for side in _SIDES if side in record.sides]:
+        raise BadInput(f"are {record.sides}"[:200], where=where, field="sides")
     try:
-        _check_record(record)
+        network_settings(**record.network)
     except HwpError as error:
         raise BadInput(str(error), where=where) from error
-    return record
-
-
-def _check_record(record: PriorRecord) -> None:
-    if record.schema != SCHEMA:
-        raise BadInput(f"is {record.schema[:40]!r} where {SCHEMA!r} is read", field="schema")
-    if not record.sides or record.sides != [side for side in _SIDES if side in record.sides]:
-        raise BadInput(f"are {record.sides}"[:200], field="sides")
-    network_settings(**record.network)
 
 
 def _check_fit(
@@ -238,7 +235,7 @@ def _check_fit(
     needed = network.to_json()
     for name, value in dataclasses.asdict(network_settings(**record.network)).items():
         if value != needed[name]:
-            raise BadInput(
+            raise OtherKind(
                 f"was made with {name} = {value}, and this fit has {needed[name]}",
                 where=where,
                 field="network",
@@ -246,7 +243,7 @@ def _check_fit(
             )
     name = record.hand_model.get("name", "")
     if name != hand_model.name:
-        raise BadInput(
+        raise OtherKind(
             f"was made with the hand model {name[:100]}, not {hand_model.name}",
             where=where,
             field="hand_model",
@@ -254,7 +251,7 @@ def _check_fit(
         )
     digest = record.hand_model.get("digest", "")
     if not _same_edition(digest, hand_model):
-        raise BadInput(
+        raise OtherKind(
             f"was made with another edition of the hand model {hand_model.name} "
             f"({digest[:12]}) than the capture ({hand_model.digest[:12]})",
             where=where,
@@ -276,13 +273,6 @@ def _same_edition(digest: str, hand_model: HandModelId) -> bool:
         # A model that is not here: its captures cannot be fitted anyway.
         return False
     return {digest, hand_model.digest} <= sides
-
-
-def _read_prior(
-    root: Path, record: PriorRecord, settings: NetworkSettings, network: PredictionNetwork | None
-) -> Prior:
-    shapes = shapes_of_settings(settings) if network is None else shapes_of(network)
-    return Prior(record, _read_weights(root / WEIGHTS, record, shapes))
 
 
 def _read_weights(

@@ -1,6 +1,6 @@
 """The subject's own hand: the template bent to the outlines of a clip's masks before the fit."""
 
 from wildghand.subject.fit_subject import fit_subject
-from wildghand.subject.shape import SubjectSettings, SubjectShape
+from wildghand.subject.shape import SubjectShape
 
-__all__ = ["SubjectSettings", "SubjectShape", "fit_subject"]
+__all__ = ["SubjectShape", "fit_subject"]

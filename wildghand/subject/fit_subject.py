@@ -18,9 +18,14 @@ from hwp_bench.base.arrays import evenly
 from hwp_bench.capture import Cameras
 from hwp_bench.hands import HandParameters, HandTemplate
 from wildghand.subject.outlines import ComparedFrames
-from wildghand.subject.shape import SubjectSettings, SubjectShape
+from wildghand.subject.shape import SubjectShape
 from wildghand.subject.unknowns import Unknowns, outline_rows
 
+#: Frames that are compared at most, evenly spread over the clip.
+FRAMES = 24
+#: Expected error of a point of the outline, px; as large as neighbouring points and frames, which
+#: err together, make it.
+NOISE = 1.5
 #: Stiffnesses among which frames that are not compared choose, the stiffest first. A stiffness
 #: multiplies the expected error of an outline and divides the expected change of a proportion.
 STIFFNESS = (8.0, 4.0, 2.0, 1.0, 0.7)
@@ -48,7 +53,6 @@ def fit_subject(
     cameras: Cameras,
     frames: np.ndarray,
     masks: np.ndarray,
-    settings: SubjectSettings,
     *,
     judges: ComparedFrames | None = None,
 ) -> SubjectShape:
@@ -65,14 +69,12 @@ def fit_subject(
         return ComparedFrames(templates, hands, cameras, frames[rows], masks[rows] > 127)
 
     every = np.arange(len(frames))
-    rows = every[evenly(len(every), settings.frames)]
-    if not settings.validated:
-        judges = None
-    elif judges is None:
+    rows = every[evenly(len(every), FRAMES)]
+    if judges is None:
         others = np.setdiff1d(every, rows)
         few = others[evenly(len(others), MOST_CHOOSING)]
         judges = compared(few) if len(others) >= LEAST_CHOOSING else None
-    bending = _Bending(compared(rows), settings)
+    bending = _Bending(compared(rows))
     shape = bending.begin(FIXED_STIFFNESS) if judges is None else _chosen(bending, judges)
     # An avatar keeps float32: it is drawn with what is read again.
     return SubjectShape(
@@ -103,14 +105,13 @@ class _Bending:
 
     Args:
         frames: that are compared.
-        settings: how.
 
     Attributes:
         shape: so far.
     """
 
-    def __init__(self, frames: ComparedFrames, settings: SubjectSettings) -> None:
-        self.frames, self.settings = frames, settings
+    def __init__(self, frames: ComparedFrames) -> None:
+        self.frames = frames
         template = next(iter(frames.templates.values()))
         self.unknowns = Unknowns.of(template, len(frames.templates), len(frames))
         self.expected = self.unknowns.expected()
@@ -158,7 +159,7 @@ class _Bending:
         if not rows or sum(map(len, gaps)) < _LEAST:
             return False
         matrix, gap = np.concatenate(rows), np.concatenate(gaps)
-        noise = stiffness * self.settings.noise
+        noise = stiffness * NOISE
         weight = 1.0 / (1.0 + (gap / reach) ** 2) ** 2 / noise**2
         # The unknowns are the whole displacement, so that each round regularises all of it.
         target = gap + matrix @ self.values

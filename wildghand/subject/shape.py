@@ -8,25 +8,7 @@ from typing import Annotated
 import numpy as np
 
 from hwp_bench.hands import HandTemplate
-from hwp_bench.methods.settings import number
 from wildghand.gaussians.found import Found, Kept
-
-
-@dataclass(frozen=True)
-class SubjectSettings:
-    """How the template is bent to the person before a fit."""
-
-    #: Bend the template to the masks of the clip.
-    enabled: bool = True
-    #: Frames that are compared at most, evenly spread over the clip.
-    frames: int = number(24, 1, 1000)
-    #: Expected error of a point of the outline, px; as large as neighbouring points and frames,
-    #: which err together, make it.
-    noise: float = number(1.5, 0.01, 1000.0)
-    #: Let frames that are not compared choose how far the hand bends: validation frames, or
-    #: training frames where there are fewer than four of those. Else the hand is rather stiff.
-    validated: bool = True
-
 
 # Largest displacement that is read, m.
 _LARGEST = 0.1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -27,34 +27,22 @@ _GAP = 8
 
 
 def live_sheet(look: Glance, aspect: float) -> np.ndarray:
-    """Return the three pictures of a glance on a sheet.
-
-    Returns:
-        (H, W, 3) uint8, H and W as `aspect` asks for.
-    """
+    """The three pictures of a glance on a sheet, (H, W, 3) uint8; W is `aspect` times H."""
     names = (f"frame {look.frame}", f"avatar, {look.psnr:.1f} dB", "weights of pixels")
     pictures = (look.truth, look.avatar, np.repeat(look.weights[..., None], 3, axis=2))
+    room = ((_GAP, _GAP), (_GAP, _GAP), (0, 0))
     tiles = [
-        labelled(fitted(image, TILE), name) for image, name in zip(pictures, names, strict=True)
+        np.pad(labelled(fitted(image, TILE), name), room, constant_values=PAPER[0])
+        for image, name in zip(pictures, names, strict=True)
     ]
-    height, width = tiles[0].shape[:2]
-    rows = [_line(tiles, 1), _line(tiles, 0)]
+    rows = [np.concatenate(tiles, axis=axis) for axis in (1, 0)]
     inner = max(rows, key=lambda line: min(aspect / line.shape[1], 1.0 / line.shape[0]))
     height, width = inner.shape[:2]
     full = max(height, round(width / aspect)), max(width, round(height * aspect))
-    page = np.full((*full, 3), PAPER, dtype=np.uint8)
     top, left = (full[0] - height) // 2, (full[1] - width) // 2
+    page = np.full((*full, 3), PAPER, dtype=np.uint8)
     page[top : top + height, left : left + width] = inner
     return page
-
-
-def _line(tiles: Sequence[np.ndarray], axis: int) -> np.ndarray:
-    """Tiles with gaps around them, along an axis of the picture."""
-    padded = [
-        np.pad(tile, ((_GAP, _GAP), (_GAP, _GAP), (0, 0)), constant_values=PAPER[0])
-        for tile in tiles
-    ]
-    return np.concatenate(padded, axis=axis)
 
 
 #: Least seconds between two pictures, and the largest share of the time that goes into them.
@@ -97,11 +85,7 @@ class Live:
 
 
 class LivePage:
-    """The page of a fit: numbers, a chart, and the pictures of one training frame.
-
-    Args:
-        server: that serves it.
-    """
+    """The page of a fit: numbers, a chart, and the pictures of one training frame."""
 
     def __init__(self, server: ViserServer) -> None:
         import viser.uplot
@@ -113,24 +97,19 @@ class LivePage:
         self._share = server.gui.add_slider(
             "training frame", min=0, max=100, step=1, initial_value=0, hint="% of the clip"
         )
+        plot = viser.uplot
         series = (
-            viser.uplot.Series(label="step"),
-            viser.uplot.Series(label="loss", stroke="#1864ab", scale="loss"),
-            viser.uplot.Series(label="PSNR, dB", stroke="#d9480f", scale="dB"),
+            plot.Series(label="step"),
+            plot.Series(label="loss", stroke="#1864ab", scale="loss"),
+            plot.Series(label="PSNR, dB", stroke="#d9480f", scale="dB"),
         )
+        scale = plot.Scale(auto=True)
+        axes = plot.Axis(label="step"), plot.Axis(scale="loss"), plot.Axis(scale="dB", side=1)
         self._chart = server.gui.add_uplot(
             (np.zeros(1), np.zeros(1), np.zeros(1)),
             series,
-            scales={
-                "x": viser.uplot.Scale(time=False),
-                "loss": viser.uplot.Scale(auto=True),
-                "dB": viser.uplot.Scale(auto=True),
-            },
-            axes=(
-                viser.uplot.Axis(label="step"),
-                viser.uplot.Axis(scale="loss"),
-                viser.uplot.Axis(scale="dB", side=1),
-            ),
+            scales={"x": plot.Scale(time=False), "loss": scale, "dB": scale},
+            axes=axes,
             aspect=1.4,
         )
         server.on_client_connect(self._arrive)
@@ -183,11 +162,7 @@ class ServedFit:
 
 @contextlib.contextmanager
 def serve_fit(address: Address | None = None, pause: float = LEAST_PAUSE) -> Iterator[ServedFit]:
-    """Serve the page of a fit while the block runs.
-
-    Args:
-        address: where it is served; None: on this machine only.
-    """
+    """Serve the page of a fit while the block runs; without an address on this machine only."""
     with serving(address or Address(), "fit") as server:
         page = LivePage(server)
         yield ServedFit(url(server), Live(page.show, page.wanted, page.row, pause), server)

@@ -14,17 +14,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 from scipy.spatial.transform import Rotation
 
 from hwp_bench.capture import Capture
 from hwp_bench.capture.schema import METADATA
 from hwp_bench.methods.contract import Camera, HandPose
-from wildghand.avatar.avatar import PosedGaussians, WildGHandAvatar, over
+from wildghand.avatar.avatar import PosedGaussians, WildGHandAvatar, over, splat
 from wildghand.avatar.render import shown_sides
 from wildghand.avatar.studio import HandAngles
-from wildghand.splat import rasterize
-from wildghand.splat.threads import denormals_flushed
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,13 +60,8 @@ class PageCamera:
         height = max(1, round(scale * self.height))
         # The page stretches the picture to its own shape, so each axis has a focal length.
         focal = 0.5 / math.tan(0.5 * self.fov)
-        K = np.array(
-            [
-                [focal * self.height * width / self.width, 0.0, 0.5 * width],
-                [0.0, focal * height, 0.5 * height],
-                [0.0, 0.0, 1.0],
-            ]
-        )
+        x = focal * self.height * width / self.width
+        K = np.array([[x, 0.0, 0.5 * width], [0.0, focal * height, 0.5 * height], [0, 0, 1.0]])
         w, x, y, z = np.asarray(self.wxyz, dtype=np.float64)
         turn = Rotation.from_quat([x, y, z, w]).inv().as_matrix()
         viewmat = np.eye(4)
@@ -107,16 +99,7 @@ def viewpoint(camera: Camera, centre: np.ndarray) -> Viewpoint:
 
 
 class Motion:
-    """The motion of a capture, for the hands that an avatar has.
-
-    Args:
-        avatar: what moves.
-        capture: whose hand parameters and cameras are used.
-
-    Raises:
-        UsageError: the capture shows no hand that the avatar has, or belongs to another hand
-            model.
-    """
+    """The motion of a capture, for the hands that an avatar has."""
 
     def __init__(self, avatar: WildGHandAvatar, capture: Capture) -> None:
         self._avatar, self._capture = avatar, capture
@@ -127,12 +110,12 @@ class Motion:
         return self._capture.info.frame_count
 
     def hands(self, frame: int) -> dict[str, HandPose]:
-        """Return the hands of a frame, by side, in the poses that the avatar believes in."""
+        """The hands of a frame, by side, in the poses that the avatar believes in."""
         poses = self._avatar.believed(self._capture.hand_poses(frame))
         return {side: poses[side] for side in self._sides}
 
     def camera(self, frame: int) -> Camera:
-        """Return the camera of a frame."""
+        """The camera of a frame."""
         return self._capture.camera(frame)
 
 
@@ -148,41 +131,10 @@ def capture_of(avatar: Path) -> Path | None:
 Hands = Mapping[str, HandPose]
 
 
-def with_angle(
-    hands: Hands, angles: HandAngles, joint: int, angle: int, degrees: float
-) -> dict[str, HandPose]:
-    """Return hands of which one has another angle; everything else stays.
-
-    Args:
-        degrees: cut to the range of the joint.
-    """
-    hand = hands[angles.side]
-    found = angles.angles(hand.pose)
-    found[joint, angle] = np.clip(degrees, angles.lower[joint, angle], angles.upper[joint, angle])
-    return {**hands, angles.side: dataclasses.replace(hand, pose=angles.pose(found))}
-
-
-def with_fingers(
-    hands: Hands, angles: Mapping[str, HandAngles], named: Mapping[str, np.ndarray]
-) -> dict[str, HandPose]:
-    """Return hands with other fingers, where they are and as they are turned.
-
-    Args:
-        named: (16, 3) degrees by side; the wrist's are left out.
-    """
-    changed = {}
-    for side, hand in hands.items():
-        pose = angles[side].pose(named[side])
-        pose[0] = hand.pose[0]
-        changed[side] = dataclasses.replace(hand, pose=pose)
-    return changed
-
-
 def shown_angles(hand: HandPose, angles: HandAngles) -> np.ndarray:
-    """Return the angles of a hand as sliders show them.
+    """(16, 3) degrees of a hand as sliders show them.
 
-    Returns:
-        (16, 3) degrees to a tenth, within the ranges: a tracked pose may lie outside of them.
+    They are rounded to a tenth and within the ranges: a tracked pose may lie outside of them.
     """
     return np.round(angles.angles(hand.pose), 1).clip(angles.lower, angles.upper)
 
@@ -206,63 +158,8 @@ class Picture:
         return max(self.image.shape[:2])
 
 
-class Painter:
-    """Draws an avatar with the rasterizer that fits and scores it.
-
-    A draft leaves out what depends on the camera (the light of normals that no frame has shown),
-    and keeps the Gaussians for as long as the hands stay: turning the camera costs pixels only.
-
-    Args:
-        avatar: what is drawn; one thread at a time may use it.
-    """
-
-    def __init__(self, avatar: WildGHandAvatar) -> None:
-        self._avatar = avatar
-        self._posed: tuple[Hands, PosedGaussians] | None = None
-
-    def full(self, hands: Hands, camera: Camera, background: tuple[int, int, int]) -> Picture:
-        """Draw as `wildghand render` does."""
-        began = time.perf_counter()
-        image = over(self._avatar.render(hands, camera), background)
-        return Picture(image, False, time.perf_counter() - began, 0.0)
-
-    @denormals_flushed()
-    @torch.no_grad()
-    def draft(self, hands: Hands, camera: Camera, background: tuple[int, int, int]) -> Picture:
-        """Draw sooner; see `full`."""
-        began = time.perf_counter()
-        if self._posed is None or self._posed[0] is not hands:
-            self._posed = hands, self._avatar.pose(hands, closed=True)
-        posed, entered = self._posed[1], time.perf_counter()
-        device = torch.device(self._avatar.device)
-
-        def tensor(array: np.ndarray) -> torch.Tensor:
-            return torch.as_tensor(array, dtype=torch.float32, device=device)
-
-        colors, coverage, _ = rasterize(
-            tensor(posed.means),
-            tensor(posed.quats),
-            tensor(posed.scales),
-            tensor(posed.opacities),
-            tensor(posed.colors),
-            tensor(camera.viewmat)[None],
-            tensor(camera.K)[None],
-            camera.width,
-            camera.height,
-        )
-        rgba = torch.cat((colors, coverage), dim=-1)[0].clamp(0.0, 1.0).nan_to_num(0.0)
-        image = over(rgba.cpu().numpy(), background)
-        return Picture(image, True, time.perf_counter() - entered, entered - began)
-
-
 class Player:
-    """Goes from frame to frame; where drawing is slower, frames are left out.
-
-    Args:
-        count: frames, which are played round and round.
-        fps: frames per second at speed 1.
-        show: takes the frame that is due.
-    """
+    """Goes round and round from frame to frame; where showing is slower, frames are left out."""
 
     def __init__(self, count: int, fps: float, show: Callable[[int], None]) -> None:
         self._count, self._fps, self._show = count, fps, show
@@ -309,6 +206,7 @@ class PosedView:
 
     Attributes:
         changed: called after each change.
+        hands: as they are now, by side; never changed in place.
     """
 
     def __init__(
@@ -322,14 +220,9 @@ class PosedView:
         self._named = {side: angles.named_poses() for side, angles in self.angles.items()}
         self.names = tuple(next(iter(self._named.values())))
         self.changed: Callable[[], None] = lambda: None
-        self._painter, self._lock = Painter(avatar), threading.Lock()
-        self._background = background
-        self._hands: Hands = avatar.studio.posed() if motion is None else motion.hands(0)
-
-    @property
-    def hands(self) -> Hands:
-        """The hands as they are now; never changed in place."""
-        return self._hands
+        self._lock, self._background = threading.Lock(), background
+        self.hands: Hands = avatar.studio.posed() if motion is None else motion.hands(0)
+        self._posed: tuple[Hands, PosedGaussians] | None = None
 
     def warm_up(self) -> None:
         """Compile what pictures need."""
@@ -338,20 +231,48 @@ class PosedView:
         self.draw(camera, False)
 
     def draw(self, camera: Camera, draft: bool) -> Picture:
-        """Draw the hands as they are now."""
+        """Draw the hands as they are now, with the rasterizer that fits and scores the avatar.
+
+        A draft leaves out what depends on the camera (the light of normals that no frame has
+        shown), and keeps the Gaussians for as long as the hands stay: turning the camera costs
+        pixels only.
+        """
+        began = time.perf_counter()
         with self._lock:
-            hands, background = self._hands, self._background
-        draw = self._painter.draft if draft else self._painter.full
-        return draw(hands, camera, background)
+            hands, background = self.hands, self._background
+        if not draft:
+            image = over(self.avatar.render(hands, camera), background)
+            return Picture(image, False, time.perf_counter() - began, 0.0)
+        if self._posed is None or self._posed[0] is not hands:
+            self._posed = hands, self.avatar.pose(hands, closed=True)
+        entered = time.perf_counter()
+        image = over(splat(self._posed[1], camera, self.avatar.device), background)
+        return Picture(image, True, time.perf_counter() - entered, entered - began)
 
     def set_angle(self, side: str, joint: int, angle: int, degrees: float) -> None:
-        """Change an angle; see `with_angle`."""
-        self._change(lambda hands: with_angle(hands, self.angles[side], joint, angle, degrees))
+        """Change an angle, cut to the range of the joint; everything else stays."""
+        angles = self.angles[side]
+        least, most = angles.lower[joint, angle], angles.upper[joint, angle]
+
+        def change(hands: Hands) -> Hands:
+            found = angles.angles(hands[side].pose)
+            found[joint, angle] = np.clip(degrees, least, most)
+            return {**hands, side: dataclasses.replace(hands[side], pose=angles.pose(found))}
+
+        self._change(change)
 
     def set_fingers(self, name: str) -> None:
-        """Give every hand the fingers of a named pose."""
-        named = {side: poses[name] for side, poses in self._named.items()}
-        self._change(lambda hands: with_fingers(hands, self.angles, named))
+        """Give every hand the fingers of a named pose, where it is and as it is turned."""
+
+        def change(hands: Hands) -> Hands:
+            changed = {}
+            for side, hand in hands.items():
+                pose = self.angles[side].pose(self._named[side][name])
+                pose[0] = hand.pose[0]
+                changed[side] = dataclasses.replace(hand, pose=pose)
+            return changed
+
+        self._change(change)
 
     def set_frame(self, frame: int) -> None:
         """Show the hands of a frame of the motion."""
@@ -389,5 +310,5 @@ class PosedView:
 
     def _change(self, change: Callable[[Hands], Hands]) -> None:
         with self._lock:
-            self._hands = change(self._hands)
+            self.hands = change(self.hands)
         self.changed()

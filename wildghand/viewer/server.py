@@ -154,19 +154,11 @@ def _check(address: Address) -> None:
             field="--host",
             remedy="Use 127.0.0.1 for this machine only, or 0.0.0.0 for every network it is in.",
         ) from error
-    if address.port:
-        _check_port(address, family)
-
-
-def _check_port(address: Address, family: int) -> None:
     with socket.socket(family, socket.SOCK_STREAM) as probe:
         try:
             probe.bind((address.host, address.port))
         except PermissionError as error:
-            raise UsageError(
-                f"{address.port} may not be used by this user",
-                field="--port",
-                remedy="Use 1024 or more.",
-            ) from error
+            problem = f"{address.port} may not be used by this user"
+            raise UsageError(problem, field="--port", remedy="Use 1024 or more.") from error
         except OSError:
             return  # taken: viser goes on to the next one

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 
 from hwp_bench.methods.settings import number
 from wildghand.gaussians.training import join_hands
+from wildghand.plain.pose_corrections import PoseCorrections
 from wildghand.plain.recipe import Batch, Drawing, FitSettings, Material, PlainRecipe, RecipeMethod
 
 
@@ -30,46 +30,24 @@ _DM = 10.0
 
 
 class JointPoseRecipe(PlainRecipe[JointPoseSettings]):
-    """See `PlainRecipe`. Poses of training frames are fitted; betas and test poses are as given.
-
-    Attributes:
-        poses: by side, (R, 16, 3) what is added to the axis-angle vectors of each frame, rad.
-        places: by side, (R, 3) what is added to the translations, m.
-    """
+    """See `PlainRecipe`. Poses of training frames are fitted; betas and test poses are as given."""
 
     def __init__(self, material: Material, settings: JointPoseSettings) -> None:
         super().__init__(material, settings)
-        given = self.clip.parameters
-        self.poses = {side: torch.zeros_like(pose) for side, (pose, _, _) in given.items()}
-        self.places = {side: torch.zeros_like(place) for side, (_, _, place) in given.items()}
+        self.corrections = PoseCorrections(self.clip)
 
     def parameters(self) -> dict[str, torch.Tensor]:
         """The plain fit's, and the corrections of each hand."""
-        return {
-            **super().parameters(),
-            **{f"pose_{side}": value for side, value in self.poses.items()},
-            **{f"transl_{side}": value for side, value in self.places.items()},
-        }
-
-    def rates(self) -> dict[str, float]:
-        """Adam's step at the start of each tensor, by name."""
-        return {
-            **super().rates(),
-            **{f"pose_{side}": self.settings.pose_rate for side in self.poses},
-            **{f"transl_{side}": self.settings.transl_rate for side in self.places},
-        }
+        return {**super().parameters(), **self.corrections.parameters()}
 
     def draw(self, batch: Batch) -> Drawing:
         """Draw the hands in their corrected poses; differentiable in these."""
         training, clip = self.material.training, self.clip
-        rows = batch.rows.to(self.material.device)
-        hands = []
-        for side, rig in self.model.rigs.items():
-            pose, betas, transl = clip.parameters[side]
-            corrected = pose[rows] + self.poses[side][rows], transl[rows] + self.places[side][rows]
-            hands.append(rig.follow(corrected[0], betas, corrected[1]))
+        rows = batch.rows.to(self.device)
+        hands = self.corrections.hands(rows)
+        poses = join_hands([rig.follow(*hands[side]) for side, rig in self.model.rigs.items()])
         image, coverage = self.model.render(
-            join_hands(hands), clip.viewmats[rows], clip.Ks[rows], training.width, training.height
+            poses, clip.viewmats[rows], clip.Ks[rows], training.width, training.height
         )
         return Drawing(image, coverage)
 
@@ -78,15 +56,15 @@ class JointPoseRecipe(PlainRecipe[JointPoseSettings]):
         loss = super().loss(batch, drawing, weights)
         if self.settings.hold_weight == 0.0:
             return loss
-        rows = batch.rows.to(self.material.device)
-        squares = [value[rows].square().mean() for value in self.poses.values()]
-        squares += [(_DM * value[rows]).square().mean() for value in self.places.values()]
+        rows, made = batch.rows.to(self.device), self.corrections
+        squares = [value[rows].square().mean() for value in made.poses.values()]
+        squares += [(_DM * value[rows]).square().mean() for value in made.places.values()]
         return loss + self.settings.hold_weight * torch.stack(squares).mean()
 
 
 class JointPoseMethod(RecipeMethod):
     """The plain fit that also corrects the poses of its training frames."""
 
-    name: ClassVar[str] = "baselines/joint-pose"
-    settings_type: ClassVar[type[JointPoseSettings]] = JointPoseSettings
-    recipe_type: ClassVar[type[JointPoseRecipe]] = JointPoseRecipe
+    name = "baselines/joint-pose"
+    settings_type = JointPoseSettings
+    recipe_type = JointPoseRecipe

@@ -4,15 +4,116 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
 
+import numpy as np
 import torch
 
 from hwp_bench.methods.settings import choice, number
-from occluder_splats_fit.occluders import make_occluders, mask_boxes
+from wildghand.gaussians.attributes import MAX_LOGIT
 from wildghand.gaussians.losses import photometric_loss
 from wildghand.gaussians.training import shares_of_255
 from wildghand.plain.recipe import Batch, Drawing, FitSettings, Material, PlainRecipe, RecipeMethod
+from wildghand.splat import rasterize
+
+#: Depth at which occluders lie, m: nearer than any hand, beyond the rasterizer's near plane.
+DISTANCE = 0.02
+# Standard deviation of an occluder at the start, in units of the distance between neighbours.
+_WIDTH = 0.6
+# Thickness along the view, as a share of the depth: it hardly shows.
+_THICKNESS = 1e-3
+# The R2 sequence (Roberts): its points cover a square evenly, however many there are.
+_R2_STEP = 1.0 / 1.32471795724474602596 ** np.array([1.0, 2.0])
+
+
+@dataclass(frozen=True, eq=False)
+class FrameOccluders:
+    """M occluders in each of R frames, on the image plane."""
+
+    #: (R, M, 2) px.
+    places: torch.Tensor
+    #: (R, M, 2) natural logarithms of the standard deviations along the two axes, px.
+    log_sigmas: torch.Tensor
+    #: (R, M) angle of the first axis, rad.
+    angles: torch.Tensor
+    #: (R, M) opacity before the sigmoid.
+    logit_opacities: torch.Tensor
+    #: (R, M, 3) sRGB colour before the sigmoid.
+    logit_colors: torch.Tensor
+
+    def parameters(self) -> dict[str, torch.Tensor]:
+        """The tensors by name, in a fixed order."""
+        return {
+            "occluder_place": self.places,
+            "occluder_shape.sigmas": self.log_sigmas,
+            "occluder_shape.angles": self.angles,
+            "occluder_opacity": self.logit_opacities,
+            "occluder_color": self.logit_colors,
+        }
+
+    def render(
+        self, rows: torch.Tensor, Ks: torch.Tensor, width: int, height: int
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Draw the occluders of frames (B,) over black: premultiplied colour, and coverage."""
+        rows = rows.to(self.places.device)
+        focal = Ks[:, None, (0, 1), (0, 1)]
+        center = Ks[:, None, :2, 2]
+        on_plane = DISTANCE * (self.places[rows] - center) / focal
+        means = torch.nn.functional.pad(on_plane, (0, 1), value=DISTANCE)
+        scales = torch.nn.functional.pad(
+            DISTANCE * self.log_sigmas[rows].exp() / focal, (0, 1), value=_THICKNESS * DISTANCE
+        )
+        half = 0.5 * self.angles[rows]
+        quats = torch.stack((half.cos(), 0.0 * half, 0.0 * half, half.sin()), dim=-1)
+        image, coverage, _ = rasterize(
+            means,
+            quats,
+            scales,
+            self.logit_opacities[rows].sigmoid(),
+            self.logit_colors[rows].sigmoid(),
+            torch.eye(4, device=Ks.device).expand(len(rows), 1, 4, 4),
+            Ks[:, None],
+            width,
+            height,
+        )
+        return image[:, 0], coverage[:, 0]
+
+
+def mask_boxes(masks: torch.Tensor, margin: float = 0.1) -> torch.Tensor:
+    """Bounding boxes of masks (R, H, W), grown by a margin and cut at the border.
+
+    (R, 4) int64 px: left, top, right, bottom; the last two are exclusive.
+    """
+    height, width = masks.shape[1:]
+    boxes = []
+    for mask in masks > 127:
+        across, down = mask.any(dim=0).nonzero()[:, 0], mask.any(dim=1).nonzero()[:, 0]
+        left, right = int(across[0]), int(across[-1]) + 1
+        top, bottom = int(down[0]), int(down[-1]) + 1
+        grow = math.ceil(margin * max(right - left, bottom - top))
+        boxes.append((left - grow, top - grow, right + grow, bottom + grow))
+    limits = torch.tensor((width, height, width, height))
+    return torch.tensor(boxes).clamp(min=0).minimum(limits)
+
+
+def make_occluders(
+    images: torch.Tensor, boxes: torch.Tensor, count: int, opacity: float, device: torch.device
+) -> FrameOccluders:
+    """Spread faint occluders evenly over the box of each frame (R, H, W, 3), in its colours."""
+    square = torch.as_tensor((0.5 + np.arange(count)[:, None] * _R2_STEP) % 1.0)
+    sizes = (boxes[:, 2:] - boxes[:, :2])[:, None].double()
+    places = (boxes[:, None, :2] + square * sizes).float()
+    spacing = (sizes.prod(dim=-1) / count).sqrt()  # (R, 1)
+    x, y = places.long().unbind(dim=-1)
+    frames = torch.arange(len(images))[:, None]
+    colors = images[frames, y, x].float() / 255.0
+    shape = places.shape[:2]
+    return FrameOccluders(
+        places=places.to(device),
+        log_sigmas=(_WIDTH * spacing).log().float()[..., None].expand(*shape, 2).clone().to(device),
+        angles=torch.zeros(shape, device=device),
+        logit_opacities=torch.full(shape, math.log(opacity / (1.0 - opacity)), device=device),
+        logit_colors=torch.logit(colors, eps=1e-6).clamp(-MAX_LOGIT, MAX_LOGIT).to(device),
+    )
 
 
 @dataclass(frozen=True)
@@ -53,16 +154,7 @@ class OccludedDrawing(Drawing):
 
 
 class OccluderRecipe(PlainRecipe[OccluderSettings]):
-    """image = C_occluders + (1 - alpha_occluders) C_hand.
-
-    Args:
-        material: what is fitted.
-        settings: how.
-
-    Attributes:
-        occluders: of each training frame.
-        boxes: (R, 4) where they start; see `mask_boxes`.
-    """
+    """image = C_occluders + (1 - alpha_occluders) C_hand."""
 
     def __init__(self, material: Material, settings: OccluderSettings) -> None:
         super().__init__(material, settings)
@@ -79,18 +171,6 @@ class OccluderRecipe(PlainRecipe[OccluderSettings]):
     def parameters(self) -> dict[str, torch.Tensor]:
         """The plain fit's, and the occluders'."""
         return {**super().parameters(), **self.occluders.parameters()}
-
-    def rates(self) -> dict[str, float]:
-        """Adam's step at the start of each tensor, by name."""
-        settings = self.settings
-        return {
-            **super().rates(),
-            "occluder_places": settings.occluder_place_rate,
-            "occluder_log_sigmas": settings.occluder_shape_rate,
-            "occluder_angles": settings.occluder_shape_rate,
-            "occluder_logit_opacities": settings.occluder_opacity_rate,
-            "occluder_logit_colors": settings.occluder_color_rate,
-        }
 
     def draw(self, batch: Batch) -> OccludedDrawing:
         """The occluders of the frames before the hand."""
@@ -136,6 +216,6 @@ class OccluderRecipe(PlainRecipe[OccluderSettings]):
 class OccluderMethod(RecipeMethod):
     """The plain fit behind occluders of each frame's own; see `OccluderRecipe`."""
 
-    name: ClassVar[str] = "baselines/occluder-splats"
-    settings_type: ClassVar[type[FitSettings]] = OccluderSettings
-    recipe_type: ClassVar[type[PlainRecipe[Any]]] = OccluderRecipe
+    name = "baselines/occluder-splats"
+    settings_type = OccluderSettings
+    recipe_type = OccluderRecipe

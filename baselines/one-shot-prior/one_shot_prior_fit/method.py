@@ -2,22 +2,114 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import cv2
 import numpy as np
 import torch
+from torch import Tensor, nn
 
-from hwp_bench.methods.contract import Avatar
+from hwp_bench.base.errors import BadInput
+from hwp_bench.methods.contract import Avatar, TrainingCapture
 from hwp_bench.methods.settings import choice, number
-from one_shot_prior_fit.model import OneShotAvatar, OneShotModel
 from wildghand.fitting.method import ready_fit
+from wildghand.gaussians.hand_avatar import DrawnAvatar, PosedHands
 from wildghand.gaussians.perceptual import FilterBankLoss
 from wildghand.gaussians.training import TrainingClip, TrainingFrames
-from wildghand.model.terms import silhouette
+from wildghand.model.model import make_model
+from wildghand.model.settings import read_settings
+from wildghand.network import NetworkSettings
+from wildghand.network.branches import CompactTexture
+from wildghand.network.heads import IdentityMap
+from wildghand.network.surface import Chart
 from wildghand.plain.recipe import Batch, Drawing, LoopSettings, Material, Recipe, RecipeMethod
+from wildghand.prior.prior import choose_prior
+
+# What the network of the prior is fitted with in WildGHand, of which nothing acts here.
+_FIT = {"dpd.enabled": False, "pao.enabled": False, "prepass.enabled": False}
+
+
+class BiasedTexture(CompactTexture):
+    """The texture branch with a learned bias on each hand's plane of features.
+
+    Planes are read linearly, so that the bias is read apart and added.
+    """
+
+    def __init__(self, settings: NetworkSettings, sides: Iterable[str]) -> None:
+        super().__init__(settings)
+        cells, width = settings.plane_resolution**2, settings.plane_width
+        self.plane_bias = nn.ParameterDict(
+            {side: nn.Parameter(torch.zeros(cells, width)) for side in sides}
+        )
+
+    def forward(self, chart: Chart, identity: IdentityMap, side: str) -> Tensor:
+        """Features of N Gaussians: (N, channels), the identity features first."""
+        features = super().forward(chart, identity, side)
+        bias = chart.planes[0](self.plane_bias[side])
+        return features + nn.functional.pad(bias, (features.shape[1] - bias.shape[1], 0))
+
+
+class OneShotModel:
+    """A hand of the prior, of which only what `parameters` names may change.
+
+    The network's colours start from `mean_color`; gain and offset, (3,) each, act on those of all
+    Gaussians.
+    """
+
+    def __init__(
+        self,
+        training: TrainingCapture,
+        gaussians: int,
+        mean_color: Tensor,
+        frame_count: int,
+        seed: int,
+        device: torch.device,
+    ) -> None:
+        settings = read_settings({**_FIT, "gaussians": gaussians})
+        templates = {side: training.template(side) for side in training.sides}
+        self.model = make_model(templates, settings, mean_color, frame_count, seed, device)
+        network = self.model.network
+        prior = choose_prior(settings, training.hand_model, network)
+        if prior is None:
+            raise BadInput(
+                f"has no prior, and {training.hand_model.name} is the capture's",
+                field="hand_model",
+                remedy="This method fits captures of the free hand model only.",
+            )
+        prior.initialise(network)
+        biased = BiasedTexture(settings.network.build(), templates).to(device)
+        biased.load_state_dict(network.texture_branch.state_dict(), strict=False)
+        network.texture_branch = biased
+        self.model.requires_grad_(False)
+        self.plane_bias = dict(biased.plane_bias.items())
+        self.gain = torch.ones(3, device=device)
+        self.offset = torch.zeros(3, device=device)
+
+    def parameters(self) -> dict[str, Tensor]:
+        """The fitted tensors by name."""
+        maps = self.model.network.identity.maps
+        return {
+            **{f"identity.{side}": values for side, values in maps.items()},
+            **{f"bias.{side}": values for side, values in self.plane_bias.items()},
+            "color.gain": self.gain,
+            "color.offset": self.offset,
+        }
+
+    def colored(self, image: Tensor, coverage: Tensor) -> Tensor:
+        """Gain and offset on every Gaussian's colour, (B, H, W, 3) sRGB over black.
+
+        Blending is linear in the colours, so that the image may be changed in their place.
+        """
+        return image * self.gain + coverage * self.offset
+
+    def draw(
+        self, hands: PosedHands, viewmats: Tensor, Ks: Tensor, width: int, height: int
+    ) -> tuple[Tensor, Tensor]:
+        """See `HandAvatar.draw`."""
+        image, coverage = self.model.draw(hands, viewmats, Ks, width, height, refine=True)
+        return self.colored(image, coverage), coverage
 
 
 @dataclass(frozen=True)
@@ -69,12 +161,7 @@ def choose_frame(frames: TrainingFrames) -> int:
 def only(frames: TrainingFrames, row: int) -> TrainingFrames:
     """One row of the training frames."""
     part = slice(row, row + 1)
-    return replace(
-        frames,
-        indices=frames.indices[part],
-        images=frames.images[part],
-        masks=frames.masks[part],
-    )
+    return TrainingFrames(frames.indices[part], frames.images[part], frames.masks[part])
 
 
 def _edge_strength(frames: TrainingFrames, row: int) -> float:
@@ -92,44 +179,24 @@ HALVED_AFTER = (0.02, 0.05, 0.10, 0.20, 0.35, 0.50, 0.75)
 
 
 class OneShotRecipe(Recipe[OneShotSettings]):
-    """Fit the identity map, the bias of the texture plane, and one gain and offset.
-
-    Attributes:
-        fitted: the frozen network and what is fitted.
-        clip: hands and cameras of the frames that are fitted.
-    """
+    """Fit the identity map, the bias of the texture plane, and one gain and offset."""
 
     def __init__(self, material: Material, settings: OneShotSettings) -> None:
         if settings.frames == "one":
             frames = only(material.frames, choose_frame(material.frames))
             material = replace(material, frames=frames)
         super().__init__(material, settings)
-        frames = material.frames
+        training, frames, device = material.training, material.frames, material.device
+        color = frames.mean_color()
         self.fitted = OneShotModel(
-            material.training,
-            settings.gaussians,
-            frames.mean_color(),
-            len(frames),
-            material.seed,
-            material.device,
+            training, settings.gaussians, color, len(frames), material.seed, device
         )
-        self.clip = TrainingClip(
-            material.training, frames.indices, self.fitted.model.rigs, material.device
-        )
+        self.clip = TrainingClip(training, frames.indices, self.fitted.model.rigs, device)
         self._perceptual = FilterBankLoss()
 
     def parameters(self) -> dict[str, torch.Tensor]:
         """See `Recipe`."""
         return self.fitted.parameters()
-
-    def rates(self) -> dict[str, float]:
-        """See `Recipe`."""
-        settings = self.settings
-        by_kind = {"identity": settings.identity_rate, "bias": settings.bias_rate}
-        return {
-            name: by_kind.get(name.partition(".")[0], settings.color_rate)
-            for name in self.parameters()
-        }
 
     def rate(self, name: str, fraction: float) -> float:
         """See `Recipe`."""
@@ -154,21 +221,19 @@ class OneShotRecipe(Recipe[OneShotSettings]):
             distance = self._perceptual(drawing.image, batch.images, weights)
             total = total + settings.perceptual * distance
         if settings.mask:
-            # Outside, the mask may be what covers the hand: it counts as little as in colours.
-            coverage = drawing.coverage[..., 0]
-            total = total + settings.mask * silhouette(coverage * weights, batch.masks * weights)
+            total = total + settings.mask * self.outline(batch, drawing, weights)
         squares = [bias.square().mean() for bias in self.fitted.plane_bias.values()]
         return total + settings.bias * torch.stack(squares).mean()
 
     def avatar(self, steps: int) -> Avatar:
         """See `Recipe`."""
-        return OneShotAvatar(self.fitted, steps)
+        return DrawnAvatar(self.fitted.draw, self.fitted.model.rigs, self.device, steps)
 
 
 class OneShotMethod(RecipeMethod):
     """See `one_shot_prior_fit.method.OneShotRecipe` for all that it does."""
 
-    name: ClassVar[str] = "baselines/one-shot-prior"
+    name = "baselines/one-shot-prior"
     settings_type = OneShotSettings
     recipe_type = OneShotRecipe
 

@@ -7,12 +7,10 @@ as they are given.
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 from wildghand.plain.recipe import RecipeMethod
 
 
 class PlainMethod(RecipeMethod):
     """The plain fit as it is; see `wildghand.plain.recipe.PlainRecipe` for all that it does."""
 
-    name: ClassVar[str] = "baselines/plain"
+    name = "baselines/plain"

@@ -3,31 +3,177 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any
 
 import numpy as np
 import torch
+from torch.nn.functional import softplus
 
 from hwp_bench.methods.contract import Camera, HandPose
 from hwp_bench.methods.settings import choice, number
-from wild_fit.frames import (
-    Appearance,
-    after_drawing,
-    appear,
-    before_drawing,
-    certain,
-    gauss_loss,
-    laplace_loss,
-    places_at_rest,
-    start_appearance,
-)
 from wildghand.gaussians.losses import photometric_loss
 from wildghand.gaussians.training import TrainingFrames
 from wildghand.plain.model import PlainAvatar, PlainModel
 from wildghand.plain.recipe import Batch, Drawing, FitSettings, Material, PlainRecipe, RecipeMethod
 from wildghand.splat.threads import denormals_flushed
+
+#: Octaves of the Gaussians' numbers at the start; each is a sine and a cosine by axis.
+OCTAVES = 4
+#: Numbers that stand for a Gaussian.
+GAUSSIAN_FEATURES = 6 * OCTAVES
+
+# The network gives gain and offset by colour, uncertainty, transient colour, transient share.
+_OUTPUTS = (3, 3, 1, 3, 1)
+# Where softplus is 1, the uncertainty at the start.
+_ONE = math.log(math.e - 1.0)
+# The transient share starts at 5 %.
+_RARE = -3.0
+
+
+@dataclass(frozen=True, eq=False)
+class Appearance:
+    """How N Gaussians look in B frames."""
+
+    #: (B, N, 3) sRGB without light, with the frame's gain and offset; within [0, 1].
+    colors: torch.Tensor
+    #: (B, N, 1) uncertainty, positive.
+    uncertainty: torch.Tensor
+    #: (B, N, 3) colour of what is only in this frame, in [0, 1].
+    transient: torch.Tensor
+    #: (B, N, 1) its share, in [0, 1].
+    share: torch.Tensor
+
+
+def start_appearance(
+    places: torch.Tensor, frames: int, frame_features: int, hidden: int, seed: int
+) -> dict[str, torch.Tensor]:
+    """The tensors before the first step, by name: `frame` (R, E), `gaussian` (N, 24), the network.
+
+    Places (N, 3) are those of `places_at_rest`. Source: the code of WildGaussians.
+    """
+    random, device = torch.Generator().manual_seed(seed), places.device
+
+    def layer(outputs: int, inputs: int) -> torch.Tensor:
+        values = 2.0 * torch.rand(outputs, inputs, generator=random) - 1.0
+        return (values / math.sqrt(inputs)).to(device)
+
+    octaves = 2.0 * math.pi * 2.0 ** torch.arange(OCTAVES, device=device)
+    phases = (places[..., None] * octaves).flatten(1)
+    inputs = 3 + GAUSSIAN_FEATURES + frame_features
+    return {
+        "frame": 0.01 * torch.randn(frames, frame_features, generator=random).to(device),
+        "gaussian": torch.cat((phases.sin(), phases.cos()), dim=-1),
+        "network.layer_1": layer(hidden, inputs),
+        "network.bias_1": torch.zeros(hidden, device=device),
+        "network.layer_2": layer(hidden, hidden),
+        "network.bias_2": torch.zeros(hidden, device=device),
+        "network.layer_3": layer(sum(_OUTPUTS), hidden),
+        "network.bias_3": torch.zeros(sum(_OUTPUTS), device=device),
+    }
+
+
+def appear(
+    tensors: Mapping[str, torch.Tensor],
+    colors: torch.Tensor,
+    frame: torch.Tensor,
+    tone_scale: float,
+) -> Appearance:
+    """Change the colours of the Gaussians as some frames do; differentiable in all tensors.
+
+    Args:
+        tensors: as `start_appearance` names them.
+        colors: (N, 3) sRGB without light.
+        frame: (B, E) the numbers of B frames.
+        tone_scale: factor on the gains and offsets.
+
+    Source: Kulhanek et al., "WildGaussians", where the gain starts at 0; here it
+    starts at 1, so that the first step is the plain fit's.
+    """
+    known = torch.cat((colors, tensors["gaussian"]), dim=-1)
+    split = known.shape[-1]
+    first = tensors["network.layer_1"]
+    # The share of the frame is the same for all Gaussians.
+    hidden = (known @ first[:, :split].T)[None] + (frame @ first[:, split:].T)[:, None]
+    hidden = (hidden + tensors["network.bias_1"]).relu()
+    hidden = (hidden @ tensors["network.layer_2"].T + tensors["network.bias_2"]).relu()
+    made = (hidden @ tensors["network.layer_3"].T + tensors["network.bias_3"]).split(
+        _OUTPUTS, dim=-1
+    )
+    gain, offset = 1.0 + tone_scale * made[0], tone_scale * made[1]
+    return Appearance(
+        colors=(colors * gain + offset).clamp(0.0, 1.0),
+        uncertainty=softplus(made[2] + _ONE),
+        transient=made[3].sigmoid(),
+        share=(made[4] + _RARE).sigmoid(),
+    )
+
+
+def places_at_rest(corners: torch.Tensor, barycentric: torch.Tensor) -> torch.Tensor:
+    """Where Gaussians in triangles (N, 3, 3) are at rest, in the hand's own size: (N, 3).
+
+    They are centred at 0.5; 97 % of the coordinates of each axis lie in [0, 1].
+    """
+    places = (corners * barycentric[..., None]).sum(dim=1)
+    places = places - places.mean(dim=0)
+    return 0.5 + 0.5 * places / torch.quantile(places.abs(), 0.97, dim=0)
+
+
+# What the geometry gets of the gradient of the uncertainty: nothing that matters.
+_LITTLE = 1e-4
+
+
+def laplace_loss(error: torch.Tensor, sigma: torch.Tensor, least: float) -> torch.Tensor:
+    """Negative log likelihood of errors under a Laplace distribution, without its constant."""
+    return error / sigma + torch.log(sigma / least)
+
+
+def gauss_loss(square: torch.Tensor, beta: torch.Tensor, least: float) -> torch.Tensor:
+    """Negative log likelihood of errors under a normal distribution, without its constant.
+    Returns:
+        r^2 / (2 beta^2) + log(beta / least); smallest at beta = |r|.
+
+    Source: Martin-Brualla et al., "NeRF in the Wild".
+    """
+    return square / (2.0 * beta.square()) + torch.log(beta / least)
+
+
+def certain(sigma: torch.Tensor) -> torch.Tensor:
+    """Whether 1 / (2 sigma^2) > 1: which pixels a fit keeps.
+
+    Source: the code of WildGaussians.
+    """
+    return 2.0 * sigma.square() < 1.0
+
+
+def before_drawing(channel: torch.Tensor) -> torch.Tensor:
+    """The same values; their gradient gets back what `after_drawing` took off."""
+    return _ScaledGradient.apply(channel, 1.0 / _LITTLE)
+
+
+def after_drawing(channel: torch.Tensor) -> torch.Tensor:
+    """The same values; their gradient is made small.
+
+    The rasterizer draws the uncertainty with the colours in one pass. Between these two functions
+    its gradient is so small that the Gaussians' places and opacities do not follow it: they are
+    for the image, and a Gaussian must not move to where an error is.
+    """
+    return _ScaledGradient.apply(channel, _LITTLE)
+
+
+class _ScaledGradient(torch.autograd.Function):
+    """The identity with a factor on its gradient."""
+
+    @staticmethod
+    def forward(ctx: Any, values: torch.Tensor, factor: float) -> torch.Tensor:
+        ctx.factor = factor
+        return values.view_as(values)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor, None]:
+        return gradient * ctx.factor, None
 
 
 @dataclass(frozen=True)
@@ -69,8 +215,6 @@ class WildAvatar:
     Args:
         bake: makes the plain model that is drawn; called when the first image is asked for, since
             a fit offers an avatar after each step and few of them are drawn.
-        steps: optimizer steps behind it.
-        device: where it is drawn.
     """
 
     def __init__(self, bake: Callable[[], PlainModel], steps: int, device: str) -> None:
@@ -123,13 +267,8 @@ class WildRecipe(PlainRecipe[WildSettings]):
             template, anchors = rig.template, rig.anchors
             corners = template.vertices[template.faces[anchors.face_index]]
             places.append(places_at_rest(corners, torch.as_tensor(anchors.barycentric)))
-        self.tensors = start_appearance(
-            torch.cat(places),
-            len(material.frames),
-            settings.frame_features,
-            settings.hidden,
-            material.seed,
-        )
+        frames, sizes = len(material.frames), (settings.frame_features, settings.hidden)
+        self.tensors = start_appearance(torch.cat(places), frames, *sizes, material.seed)
         self.brightness = _brightness(material.frames)
         self.frame_uncertainty = torch.full((len(material.frames),), torch.inf)
         self._drawn = torch.zeros(len(material.frames))
@@ -138,21 +277,13 @@ class WildRecipe(PlainRecipe[WildSettings]):
         """The plain fit's, and those of the appearance."""
         return {**super().parameters(), **self.tensors}
 
-    def rates(self) -> dict[str, float]:
-        """Adam's step at the start of each tensor, by name."""
-        settings = self.settings
-        rates = dict.fromkeys(self.tensors, settings.network_rate)
-        rates["frame_features"] = settings.frame_rate
-        rates["gaussian_features"] = settings.gaussian_rate
-        return {**super().rates(), **rates}
-
     def draw(self, batch: Batch) -> WildDrawing:
         """Draw the frames in their own and in the shared colours, with the uncertainty."""
         training, clip, model = self.material.training, self.clip, self.model
         rows = batch.rows.to(self.material.device)
         poses = clip.poses(batch.rows)
         shared = model.gaussians.logit_colors.sigmoid()
-        look = self.appear(shared, self.tensors["frame_features"][rows])
+        look = self.appear(shared, self.tensors["frame"][rows])
         own = look.colors
         if self.settings.uncertainty == "nerf-w":
             own = (1.0 - look.share) * own + look.share * look.transient
@@ -230,7 +361,7 @@ class WildRecipe(PlainRecipe[WildSettings]):
         """(1, E) the mean numbers of the least uncertain frames, which stand for test frames."""
         order = torch.argsort(self.frame_uncertainty, stable=True)
         kept = order[: max(1, round(self.settings.test_share * len(order)))]
-        return self.tensors["frame_features"][kept.to(self.material.device)].mean(0, keepdim=True)
+        return self.tensors["frame"][kept.to(self.material.device)].mean(0, keepdim=True)
 
     def avatar(self, steps: int) -> WildAvatar:
         """The avatar in the look of the least uncertain frames, without transient colours."""
@@ -248,17 +379,15 @@ class WildRecipe(PlainRecipe[WildSettings]):
 
 def _brightness(frames: TrainingFrames) -> torch.Tensor:
     """(R,) mean sRGB of the hand in each frame, as a share of the mean of all frames."""
-    found = []
-    for image, mask in zip(frames.images, frames.masks, strict=True):
-        # One of 255 more, so that a black frame has a brightness.
-        found.append(image[mask > 127].float().mean() + 1.0)
-    brightness = torch.stack(found)
+    # One of 255 more, so that a black frame has a brightness.
+    pairs = zip(frames.images, frames.masks, strict=True)
+    brightness = torch.stack([image[mask > 127].float().mean() + 1.0 for image, mask in pairs])
     return brightness / brightness.mean()
 
 
 class WildMethod(RecipeMethod):
     """The plain fit with an appearance and an uncertainty of each training frame."""
 
-    name: ClassVar[str] = "baselines/wild"
-    settings_type: ClassVar[type[WildSettings]] = WildSettings
-    recipe_type: ClassVar[type[WildRecipe]] = WildRecipe
+    name = "baselines/wild"
+    settings_type = WildSettings
+    recipe_type = WildRecipe

@@ -8,7 +8,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from hwp_bench.base.errors import BadInput, HwpError, MissingDependency, UsageError
 from hwp_bench.base.files import cache_root, inside, read_json, sha256_file, write_json
@@ -35,16 +35,6 @@ class RemoteFile:
     sha256: str | None
 
 
-class Hub(Protocol):
-    """A server of the release."""
-
-    def files(self, revision: str | None) -> tuple[str, list[RemoteFile]]:
-        """Return the commit that a revision names, and its files."""
-
-    def fetch(self, name: str, commit: str, folder: Path) -> Path:
-        """Download one file below a folder, going on where an earlier try stopped."""
-
-
 @dataclass(frozen=True)
 class Download:
     """The result of a download."""
@@ -64,7 +54,7 @@ class Download:
 class HuggingFaceHub:
     """The hub through `huggingface_hub`."""
 
-    def __init__(self, repository: str = REPOSITORY) -> None:
+    def __init__(self) -> None:
         try:
             self._hub: Any = importlib.import_module("huggingface_hub")
         except ImportError as error:
@@ -72,13 +62,10 @@ class HuggingFaceHub:
                 "huggingface_hub is not installed",
                 remedy="pip install 'hwp-bench[hub]', or download the release by hand.",
             ) from error
-        self._repository = repository
 
     def files(self, revision: str | None) -> tuple[str, list[RemoteFile]]:
         """Return the commit that a revision names, and its files."""
-        info = self._hub.HfApi().dataset_info(
-            self._repository, revision=revision, files_metadata=True
-        )
+        info = self._hub.HfApi().dataset_info(REPOSITORY, revision=revision, files_metadata=True)
         files = []
         for item in info.siblings or []:
             stated = getattr(item, "lfs", None)
@@ -92,7 +79,7 @@ class HuggingFaceHub:
         """Download one file below a folder, going on where an earlier try stopped."""
         return Path(
             self._hub.hf_hub_download(
-                self._repository,
+                REPOSITORY,
                 name,
                 repo_type="dataset",
                 revision=commit,
@@ -103,7 +90,7 @@ class HuggingFaceHub:
 
 def download_release(
     out: str | os.PathLike[str],
-    hub: Hub,
+    hub: HuggingFaceHub,
     *,
     captures: Sequence[str] = (),
     revision: str | None = None,
@@ -127,7 +114,12 @@ def download_release(
     commit, files = _ask(hub.files, record["commit"] if record else revision)
     if not re.fullmatch(r"[0-9A-Za-z._-]{1,64}", commit):
         raise BadInput("the hub does not name a commit", where=REPOSITORY)
-    chosen = [item for item in files if _matches(item.name, captures)]
+    chosen = [
+        item
+        for item in files
+        if not captures
+        or any(part.startswith(tuple(captures)) for part in re.split(r"[\\/]", item.name))
+    ]
     if not chosen:
         raise UsageError("no file of the release matches", field="--capture")
     targets = {item.name: inside(folder, item.name) for item in chosen}
@@ -171,12 +163,6 @@ def _record(folder: Path) -> dict[str, Any] | None:
             remedy="Choose an empty folder.",
         )
     return None
-
-
-def _matches(name: str, captures: Sequence[str]) -> bool:
-    return not captures or any(
-        part.startswith(tuple(captures)) for part in re.split(r"[\\/]", name)
-    )
 
 
 def _verified(item: RemoteFile, target: Path, pinned: str | None) -> str:

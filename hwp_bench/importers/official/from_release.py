@@ -5,6 +5,19 @@ with the left hand's parameters, centres it on its middle knuckle, negates x, an
 and the translation. The left parameters are therefore those of a mirrored right hand: a rotation
 vector (x, y, z) becomes (x, -y, -z) in the left hand's own frame. The translation is taken from the
 stored vertices in closed form, so that no convention about the centre is assumed.
+
+The released loader (`wildghand/data_single.py`, `data_multi.py`) differs in these points:
+
+- It sends the pair of focal lengths through the crop's affine map as if it were a point. A focal
+  length scales and does not shift, so its fx and fy are off by the map's translation
+  (-scale * corner) and differ from each other.
+- It makes the box square in integer arithmetic, which rounds centre and corner down.
+- Its affine map puts the pixel centres of the image at integers, while the principal point
+  is half the size, which is a half-pixel convention: image and camera differ by up to half
+  a pixel of the crop.
+- It samples the large frame at single points (bilinear, no low-pass), so crops are aliased.
+- It changes the box in the loaded data in place: a frame that is read twice by one process has
+  another crop the second time. `official_crop` gives the first.
 """
 
 from __future__ import annotations
@@ -17,37 +30,170 @@ from typing import Any
 
 import numpy as np
 
-from hwp_bench.base.errors import BadInput, UsageError, bounded
+from hwp_bench.base.console import progress
+from hwp_bench.base.errors import BadInput, bounded
 from hwp_bench.base.files import sha256_file
-from hwp_bench.base.images import is_blank, read_gray
-from hwp_bench.capture import Cameras, CaptureInfo, identify_hand_model
+from hwp_bench.base.images import is_blank, read_gray, read_rgb
+from hwp_bench.capture import Cameras
 from hwp_bench.capture.schema import check_id
 from hwp_bench.hands import HandParameters, HandTemplate, load_template
-from hwp_bench.hands.fitting import FitTargets, fit_hand
+from hwp_bench.hands.fitting import FitTargets
+from hwp_bench.hands.poses import mirrored
+from hwp_bench.hands.skinning import pose_parameters
 from hwp_bench.hands.sources import FINGERTIPS
-from hwp_bench.importers.official.crop import (
-    MASK_THRESHOLD,
-    CroppedFrame,
-    crop_frames,
-    tracked_joints,
-)
 from hwp_bench.importers.official.records import (
     OfficialFolder,
     OfficialRecords,
     SideRecords,
     read_records,
 )
-from hwp_bench.importers.shared.frames import cells
+from hwp_bench.importers.shared.frames import cells, cut, each_frame, resample
 from hwp_bench.importers.shared.output import (
     ProjectedHand,
-    overlay_sheet,
-    pose_parameters,
+    ReleaseImport,
+    check_choices,
+    fit_free_hand,
     project_hand,
     refuse_existing,
-    sheet_frames,
     write_capture,
 )
 from hwp_bench.taxonomy import catalogue
+
+# --- Crop, mask and intrinsics of the frames: computed correctly, or as the released loader does
+
+#: A mask pixel above this is hand, as in the released loader.
+MASK_THRESHOLD = 100
+#: The joints' box is enlarged by this, as where the release has a box.
+BOX_SCALE = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class CroppedFrame:
+    """One frame of the capture."""
+
+    #: (S, S, 3) uint8 sRGB.
+    image: np.ndarray
+    #: (S, S) uint8, 255 = hand.
+    mask: np.ndarray
+    #: (3, 3) px of the crop.
+    K: np.ndarray
+    #: (2,) px of the whole frame, top left corner of the crop.
+    corner: np.ndarray
+    #: Edge of the crop, px of the whole frame.
+    side: float
+
+
+def crop_frames(
+    records: OfficialRecords, size: int, *, compat: bool
+) -> tuple[list[CroppedFrame], np.ndarray]:
+    """Crop every frame of a capture; with (F, 2) half the size of the whole frames, px.
+
+    `size` is the edge of the crops, px; `compat` crops as the released loader does.
+    """
+
+    def one(frame: int) -> tuple[CroppedFrame, tuple[float, float]]:
+        image = read_rgb(records.images[frame])
+        mask = read_gray(records.masks[frame], image.shape[:2])
+        box = records.boxes[frame]
+        if box is None and compat:
+            # The loader then halves the intrinsics and leaves the frame as it is, which no
+            # network of 256 px can take.
+            raise BadInput(
+                "has no bbox_inter, without which the released loader does not crop",
+                where=records.images[frame],
+                remedy="Import it without --official-compat.",
+            )
+        if box is None:
+            seen = [hand.landmarks[frame] for hand in records.sides.values() if hand.valid[frame]]
+            if not seen:
+                raise BadInput("has neither a box nor a hand", where=records.images[frame])
+            box = box_of_landmarks(np.concatenate(seen))
+        crop = official_crop if compat else correct_crop
+        height, width = image.shape[:2]
+        cropped = crop(image, mask, box, float(records.focal[frame]), size)
+        return cropped, (width / 2.0, height / 2.0)
+
+    count = len(records.images)
+    crops, centres = [], []
+    with progress("cropping frames", count) as update:
+        for cropped, centre in each_frame(one, range(count)):
+            crops.append(cropped)
+            centres.append(centre)
+            update(len(crops))
+    return crops, np.array(centres)
+
+
+def box_of_landmarks(landmarks: np.ndarray) -> np.ndarray:
+    """The box that the release's pre-processing makes of joints (N, 2) px of all hands.
+
+    (4,) int64 x1, y1, x2, y2: the joints' box, 1.5 times as large about its centre.
+    """
+    low, high = landmarks.min(axis=0), landmarks.max(axis=0)
+    centre, half = (low + high) / 2, (high - low) * BOX_SCALE // 2
+    return np.concatenate([centre - half, centre + half]).astype(np.int64)
+
+
+def correct_crop(
+    image: np.ndarray, mask: np.ndarray, box: np.ndarray, focal: float, size: int
+) -> CroppedFrame:
+    """Cut the smallest square of whole pixels about a box, black outside the image.
+
+    The box is x1, y1, x2, y2, px; the focal length that of the whole frame, px, whose centre is the
+    principal point. Crops are resampled, by area, to `size` px.
+    """
+    height, width = image.shape[:2]
+    box = np.asarray(box, dtype=np.float64)
+    side = int(np.ceil(max(box[2] - box[0], box[3] - box[1], 2.0)))
+    corner = np.round((box[:2] + box[2:]) / 2 - side / 2).astype(np.int64)
+    scale = size / side
+    K = np.array([[focal * scale, 0, 0], [0, focal * scale, 0], [0, 0, 1.0]])
+    K[:2, 2] = (np.array([width / 2, height / 2]) - corner) * scale
+    binary = np.where(mask > MASK_THRESHOLD, 255, 0).astype(np.uint8)
+    return CroppedFrame(
+        resample(cut(image, corner, side), size),
+        resample(cut(binary, corner, side), size),
+        K,
+        corner,
+        side,
+    )
+
+
+def official_crop(
+    image: np.ndarray, mask: np.ndarray, box: np.ndarray, focal: float, size: int
+) -> CroppedFrame:
+    """Crop as the released loader does; of the box the type matters, as in the loader."""
+    import cv2
+
+    height, width = image.shape[:2]
+    square = np.array(box)
+    square[2:] -= square[:2]
+    edge = square[2:].max()
+    centre = square[:2] + square[2:] / 2.0
+    square[2:] = edge
+    square[:2] = centre - edge / 2.0  # integers drop the half
+    corner, side = square[:2].astype(np.float64), float(edge)
+    scale = size / side
+    shift = -scale * corner
+    matrix = np.array([[scale, 0, shift[0]], [0, scale, shift[1]]], dtype=np.float32)
+
+    def warp(pixels: np.ndarray) -> np.ndarray:
+        return cv2.warpAffine(pixels, matrix, (size, size), flags=cv2.INTER_LINEAR)
+
+    hand = warp((mask > MASK_THRESHOLD).astype(np.uint8)) > 0
+    warped = np.round(warp(image.astype(np.float32))).clip(0, 255).astype(np.uint8)
+    K = np.eye(3)
+    K[0, 0], K[1, 1] = scale * focal + shift
+    K[:2, 2] = scale * np.array([width / 2, height / 2]) + shift
+    return CroppedFrame(
+        np.where(hand[:, :, None], warped, 0).astype(np.uint8),
+        np.where(hand, 255, 0).astype(np.uint8),
+        K,
+        corner,
+        side,
+    )
+
+
+# --- The import
 
 #: Terms of the release; the capture made of it may not be given away under other terms.
 LICENCE = "as the official HWP release (its authors' terms)"
@@ -63,46 +209,25 @@ _TIP_ROWS = [4, 8, 12, 16, 20]
 _MIN_SHARE, _MIN_LEAD, _LOOKED_AT = 0.5, 0.1, 24
 
 
-@dataclass(frozen=True)
-class OfficialImport:
-    """Choices of an import; checked when made.
+@dataclass(frozen=True, kw_only=True)
+class OfficialImport(ReleaseImport):
+    """Choices of an import, also those of `ReleaseImport`; checked when made."""
 
-    Raises:
-        UsageError: a choice makes no sense.
-    """
-
-    #: MANO file or folder, or None to fit the free hand.
-    mano: Path | None = None
     #: Crop, intrinsics and translations as the released loader has them, mistakes included.
     official_compat: bool = False
     #: Which hand of a single-hand capture; None decides by the masks.
     hand: str | None = None
-    #: Edge of the stored frames, px.
-    size: int = 256
     #: Frames per second of the video before subsampling; the release does not state it.
     video_fps: float = 30.0
-    #: Replace an existing capture.
-    overwrite: bool = False
 
     def __post_init__(self) -> None:
-        rules = (
+        super().__post_init__()
+        whole = not self.official_compat or self.size == 256
+        check_choices(
             ("--hand", self.hand in (None, "right", "left"), "must be right or left"),
-            ("--size", 32 <= self.size <= 2048, "must be 32 to 2048 px"),
             ("--fps", 0 < self.video_fps < 1000, "must be above 0 and below 1000"),
-            (
-                "--official-compat",
-                not self.official_compat or self.size == 256,
-                "means frames of 256 px",
-            ),
+            ("--official-compat", whole, "means frames of 256 px"),
         )
-        for option, good, problem in rules:
-            if not good:
-                raise UsageError(problem, field=option)
-
-    @property
-    def model(self) -> str:
-        """The hand model, as `load_template` takes it."""
-        return "anny" if self.mano is None else f"mano:{Path(self.mano).absolute()}"
 
 
 def import_official(
@@ -128,49 +253,37 @@ def import_official(
         side: project_hand(load_template(options.model, side), made.hand, cameras)
         for side, made in hands.items()
     }
-    tracked = tracked_joints(records, sides, crops, options.size)
+    # The tracker's joints in the crops: (F, 21 * sides, 2) px, NaN where not valid.
+    corners = np.array([crop.corner for crop in crops], dtype=np.float64)
+    scales = options.size / np.array([crop.side for crop in crops], dtype=np.float64)
+    tracked = np.concatenate(
+        [
+            np.where(
+                records.sides[side].valid[:, None, None],
+                (records.sides[side].landmarks - corners[:, None]) * scales[:, None, None],
+                np.nan,
+            )
+            for side in sides
+        ],
+        axis=1,
+    )
     facts = _facts(folder, records, hands, clips, tracked, crops, warnings, options)
-    info = _info(folder, records, sides, facts, options)
-    shown = sheet_frames(len(crops))
-
-    def sheet() -> np.ndarray:
-        images = {frame: crops[frame].image for frame in shown}
-        masks = {frame: crops[frame].mask for frame in shown}
-        dots = {frame: tracked[frame] for frame in shown}
-        return overlay_sheet(list(clips.values()), images, masks, dots)
-
+    entry = catalogue().get(folder.id)
     write_capture(
         out,
-        info,
         {side: made.hand for side, made in hands.items()},
         cameras,
         ((crop.image, crop.mask) for crop in crops),
-        sheet,
+        list(clips.values()),
         facts,
         overwrite=options.overwrite,
-    )
-    return facts
-
-
-def _info(
-    folder: OfficialFolder,
-    records: OfficialRecords,
-    sides: tuple[str, ...],
-    facts: Mapping[str, Any],
-    options: OfficialImport,
-) -> CaptureInfo:
-    entry = catalogue().get(folder.id)
-    shown = "both" if len(sides) == 2 else sides[0]
-    return CaptureInfo(
+        model=options.model,
+        size=options.size,
+        tracked=tracked,
         id=folder.id,
-        hands=shown,
         action=entry.action if entry else "unknown",
         device=entry.device if entry else "unknown",
         fps=options.video_fps / (folder.subsample or 1),
-        width=options.size,
-        height=options.size,
-        frame_count=len(records.numbers),
-        hand_model=identify_hand_model(options.model, shown),
         perturbations=dict.fromkeys(entry.perturbations) if entry else {},
         source={
             "kind": "official HWP release",
@@ -180,10 +293,11 @@ def _info(
             "video_fps": {"value": options.video_fps, "from": "assumed, or given by the user"},
             "frames": records.numbers.tolist(),
             "focal": records.focal.tolist(),
-            "import": dict(facts),
+            "import": facts,
         },
         licence=LICENCE,
     )
+    return facts
 
 
 def _facts(
@@ -360,7 +474,7 @@ def _import_hand(
 
 def _own_rotations(pose: np.ndarray, side: str) -> np.ndarray:
     """Rotation vectors (F, 16, 3) of a hand in its own frame, of the tracker's."""
-    return pose if side == "right" else pose * np.array([1.0, -1.0, -1.0])
+    return pose if side == "right" else mirrored(pose)
 
 
 def _mano_hand(
@@ -412,8 +526,6 @@ def _free_hand(
     rays = np.concatenate([offsets, np.ones((*offsets.shape[:2], 1))], axis=2)
     rays /= np.linalg.norm(rays, axis=2, keepdims=True)
     pose = _own_rotations(np.where(valid[:, None, None], records.pose, 0.0), template.side)
-    unplaced = HandParameters(pose, np.zeros(10), np.zeros((len(pose), 3)), valid)
-    shift = knuckle - pose_parameters(template, unplaced).landmarks[:, 9].numpy()
-    start = replace(unplaced, transl=np.where(valid[:, None], shift, 0.0))
-    fitted = fit_hand(template, FitTargets(landmarks, rays, records.vertices[:, ::2]), start)
+    targets = FitTargets(landmarks, rays, records.vertices[:, ::2])
+    fitted = fit_free_hand(template, pose, valid, knuckle, targets)
     return ImportedHand(fitted.parameters, fitted.skin_mm)

@@ -201,7 +201,7 @@ def read_records(folder: OfficialFolder) -> OfficialRecords:
     return OfficialRecords(
         numbers=np.array([number for number, _, _ in rows]),
         images=tuple(_file(row, "img_path", pickle) for _, row, pickle in rows),
-        masks=tuple(_file(_with_mask(row), "mask_sam1_path", pickle) for _, row, pickle in rows),
+        masks=tuple(_file(row, "mask_sam1_path", pickle) for _, row, pickle in rows),
         focal=_focal(rows),
         boxes=tuple(_box(row, pickle, number) for number, row, pickle in rows),
         root_rel=_stack(rows, "root_rel", (3,), optional="left" not in sides),
@@ -217,44 +217,26 @@ Rows = Sequence[tuple[int, dict[str, Any], Path]]
 def _number(row: Any, index: int, pickle: Path) -> int:
     if not isinstance(row, dict):
         raise BadInput(f"record {index} is not a dict", where=pickle)
+    field = f"record {index}: img_path"
     path = row.get("img_path")
     if not isinstance(path, str):
         problem = "is missing" if path is None else f"is a {type(path).__name__}, not a string"
-        raise BadInput(problem, where=pickle, field=f"record {index}: img_path")
+        raise BadInput(problem, where=pickle, field=field)
     found = re.search(r"\d{1,15}", re.split(r"[\\/]", path)[-1])
     if found is None:
-        raise BadInput(
-            f"{path[-80:]!r} has no number", where=pickle, field=f"record {index}: img_path"
-        )
+        raise BadInput(f"{path[-80:]!r} has no number", where=pickle, field=field)
     return int(found.group())
 
 
 def _file(row: Mapping[str, Any], key: str, pickle: Path) -> Path:
-    named = row[key]
+    named = row.get(key)
+    if key not in row:
+        # The release names a mask after its image.
+        stem, dot, ending = row["img_path"].rpartition(".")
+        named = f"{stem}_sam1_mask{dot}{ending}"
     if not isinstance(named, str):
         raise BadInput(f"is a {type(named).__name__}, not a string", where=pickle, field=key)
     return find_file(pickle.parent, named, where=pickle, field=key)
-
-
-def _with_mask(row: dict[str, Any]) -> dict[str, Any]:
-    if "mask_sam1_path" in row:
-        return row
-    stem, dot, ending = row["img_path"].rpartition(".")
-    return {**row, "mask_sam1_path": f"{stem}_sam1_mask{dot}{ending}"}
-
-
-def _focal(rows: Rows) -> np.ndarray:
-    values = []
-    for number, row, pickle in rows:
-        value = _array(row, "scaled_focal_length", pickle, number)
-        if value.size != 1 or not 0 < float(value.ravel()[0]) < 1e7:
-            raise BadInput(
-                f"frame {number}: is not a focal length in pixels",
-                where=pickle,
-                field="scaled_focal_length",
-            )
-        values.append(float(value.ravel()[0]))
-    return np.array(values)
 
 
 def _box(row: Mapping[str, Any], pickle: Path, number: int) -> np.ndarray | None:
@@ -263,9 +245,8 @@ def _box(row: Mapping[str, Any], pickle: Path, number: int) -> np.ndarray | None
     box = _array(row, "bbox_inter", pickle, number)
     finite = box.shape == (4,) and np.isfinite(box).all()
     if not finite or not (box[2] > box[0] and box[3] > box[1]) or np.abs(box).max() > 1e6:
-        raise BadInput(
-            f"frame {number}: is not a box x1, y1, x2, y2", where=pickle, field="bbox_inter"
-        )
+        said = f"frame {number}: is not a box x1, y1, x2, y2"
+        raise BadInput(said, where=pickle, field="bbox_inter")
     return box
 
 
@@ -288,25 +269,30 @@ def _stack(rows: Rows, key: str, shape: tuple[int, ...], *, optional: bool = Fal
         if optional and key not in row:
             continue
         value = _array(row, key, pickle, number)
-        if value.shape not in ((1, *shape), shape):
-            raise BadInput(
-                f"frame {number}: has shape {value.shape} where {(1, *shape)} is expected",
-                where=pickle,
-                field=key,
-            )
+        if value.shape not in ((1, *shape), shape) and (shape or value.size != 1):
+            said = f"frame {number}: has shape {value.shape} where {(1, *shape)} is expected"
+            raise BadInput(said, where=pickle, field=key)
         stacked[index] = value.reshape(shape)
     return stacked
 
 
+def _focal(rows: Rows) -> np.ndarray:
+    focal = _stack(rows, "scaled_focal_length", ())
+    for value, (number, _, pickle) in zip(focal, rows, strict=True):
+        if not 0 < value < 1e7:
+            said = f"frame {number}: is not a focal length in pixels"
+            raise BadInput(said, where=pickle, field="scaled_focal_length")
+    return focal
+
+
 def _array(row: Mapping[str, Any], key: str, pickle: Path, number: int) -> np.ndarray:
+    value, problem = row.get(key), ""
     if key not in row:
-        raise BadInput(f"frame {number}: is missing", where=pickle, field=key)
-    value = row[key]
-    if isinstance(value, bool) or not isinstance(value, int | float | np.ndarray | np.generic):
-        raise BadInput(
-            f"frame {number}: is a {type(value).__name__}, not an array", where=pickle, field=key
-        )
-    array = np.asarray(value)
-    if array.dtype.kind not in "fiu":
-        raise BadInput(f"frame {number}: holds {array.dtype}", where=pickle, field=key)
-    return array
+        problem = "is missing"
+    elif isinstance(value, bool) or not isinstance(value, int | float | np.ndarray | np.generic):
+        problem = f"is a {type(value).__name__}, not an array"
+    elif np.asarray(value).dtype.kind not in "fiu":
+        problem = f"holds {np.asarray(value).dtype}"
+    if problem:
+        raise BadInput(f"frame {number}: {problem}", where=pickle, field=key)
+    return np.asarray(value)

@@ -42,10 +42,12 @@ class CropWindows:
     #: Pixels of the resampled crop.
     size: int
 
-    @property
-    def scale(self) -> float:
-        """Pixels of the crop for each pixel of the whole frame."""
-        return self.size / self.side
+    def place(
+        self, pixels: np.ndarray, edge: int | None = None, frame: int | slice = slice(None)
+    ) -> np.ndarray:
+        """Move (F, P, 2) px of the whole frames, or (P, 2) of one, to crops of `edge` px."""
+        corners = self.corners[frame][..., None, :]
+        return (pixels - corners) * ((edge or self.size) / self.side)
 
     def intrinsics(self, K: np.ndarray) -> np.ndarray:
         """Camera matrices of the cropped frames, (F, 3, 3), of that of the whole frame, (3, 3) px.
@@ -55,7 +57,7 @@ class CropWindows:
         """
         matrices = np.tile(K, (len(self.corners), 1, 1))
         matrices[:, :2, 2] -= self.corners
-        matrices[:, :2] *= self.scale
+        matrices[:, :2] *= self.size / self.side
         return matrices
 
 

@@ -22,23 +22,19 @@ import numpy as np
 
 from hwp_bench.base.arrays import read_npz, take, write_npz
 from hwp_bench.base.errors import BadInput
+from hwp_bench.hands.skeleton import SIDES
 
 #: Version of the file that is written.
 VERSION = 2
-#: Sides in the order of `votes`.
-SIDES = ("right", "left")
 #: MediaPipe (= OpenPose) order, the order of every landmark array in this package.
 LANDMARK_NAMES = (
     "wrist",
     *(f"{finger}_{k}" for finger in ("thumb", "index", "middle", "ring", "little") for k in "1234"),
 )
-#: Pairs of landmarks that a drawing connects.
-LANDMARK_EDGES = (
-    *((0, 4 * finger + 1) for finger in range(5)),
-    *((4 * finger + k, 4 * finger + k + 1) for finger in range(5) for k in (1, 2, 3)),
-)
 #: Landmarks that move with the palm: wrist, thumb base, and the four knuckles.
 PALM = (0, 1, 5, 9, 13, 17)
+# What other trackers' files contain too, of one hand.
+_NAMES = ("image", "world", "score")
 #: Range of a hand's extent, m: from a small child's fist to a large open hand, with a margin.
 HAND_METRES = (0.02, 0.5)
 
@@ -47,24 +43,26 @@ HAND_METRES = (0.02, 0.5)
 class HandTracks:
     """Up to two hands in every frame of a video, the one that is seen most first.
 
-    Attributes:
-        image: (H, F, 21, 3) float32, x, y in px of the whole frame, z in the same unit; zero where
-            the hand is not seen.
-        world: (H, F, 21, 3) float32, m.
-        score: (H, F) float32, the tracker's confidence in [0, 1]; 0 where the hand is not seen.
-        right: (H, F) float32, the network's probability that it is a right hand; 0.5 where the
-            hand is not seen.
-        track: (H, F) int32, number of the stretch in which the hand was followed; -1 where the
-            hand is not seen.
-        size: (width, height) of the video, px.
+    Where a hand is not seen its score is 0, and its other values have no meaning.
     """
 
+    #: (H, F, 21, 3) float32, x, y in px of the whole frame, z in the same unit.
     image: np.ndarray
+    #: (H, F, 21, 3) float32, m.
     world: np.ndarray
+    #: (H, F) float32, the tracker's confidence in [0, 1].
     score: np.ndarray
+    #: (H, F) float32, the network's probability that it is a right hand.
     right: np.ndarray
+    #: (H, F) int32, number of the stretch in which the hand was followed.
     track: np.ndarray
+    #: (width, height) of the video, px.
     size: tuple[int, int]
+
+    @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All but the size, by name."""
+        return {name: value for name, value in vars(self).items() if name != "size"}
 
     def seen(self, hand: int) -> np.ndarray:
         """Return (F,) bool: frames in which a hand is seen."""
@@ -98,14 +96,8 @@ def write_hand_tracks(path: str | os.PathLike[str], tracks: HandTracks) -> Path:
         {
             "version": np.array([VERSION], dtype=np.int32),
             "size": np.array(tracks.size, dtype=np.int32),
-            "image": tracks.image[0],
-            "world": tracks.world[0],
-            "score": tracks.score[0],
-            "hands_image": tracks.image,
-            "hands_world": tracks.world,
-            "hands_score": tracks.score,
-            "hands_right": tracks.right,
-            "hands_track": tracks.track,
+            **{name: tracks.arrays[name][0] for name in _NAMES},
+            **{f"hands_{name}": value for name, value in tracks.arrays.items()},
         },
     )
 
@@ -134,9 +126,10 @@ def _tracks_of(
         raise BadInput(
             f"has shape {score.shape}, expected (1 or 2, frames)", where=where, field="hands_score"
         )
-    shape = (hands, frames, 21, 3)
-    image = take(arrays, "hands_image", shape, where=where, dtype=np.float32)
-    world = take(arrays, "hands_world", shape, where=where, dtype=np.float32)
+    image, world = (
+        take(arrays, f"hands_{name}", (hands, frames, 21, 3), where=where, dtype=np.float32)
+        for name in ("image", "world")
+    )
     right = take(arrays, "hands_right", (hands, frames), where=where, dtype=np.float32)
     track = take(arrays, "hands_track", (hands, frames), where=where, dtype=np.int32)
     for name, values in (("hands_score", score), ("hands_right", right)):
@@ -216,8 +209,13 @@ def associate(tracks: HandTracks) -> Association:
     if len(tracks.score) == 1:
         return Association(tracks, 0, 0)
     seen = (tracks.score > 0) & np.isfinite(tracks.image).all(axis=(2, 3))
-    size = _size(tracks, seen)
-    double = _doubles(tracks, seen, size)
+    # Median extent of a hand, px.
+    shown = tracks.image[..., :2][seen]
+    size = max(float(np.median(np.ptp(shown, axis=1).max(axis=1))), 1.0) if len(shown) else 1.0
+    # Frames in which both rows show one hand.
+    both = np.flatnonzero(seen.all(axis=0))
+    apart = tracks.image[0, both, :, :2] - tracks.image[1, both, :, :2]
+    double = both[np.linalg.norm(apart, axis=-1).mean(axis=1) < _SAME_HAND * size]
     score = tracks.score.copy()
     worse = tracks.score.argmin(axis=0)
     score[worse[double], double] = 0.0
@@ -225,20 +223,11 @@ def associate(tracks: HandTracks) -> Association:
     crossed = _crossed(tracks, seen, size)
     moments = np.flatnonzero(seen.any(axis=0))
     swaps = int(np.count_nonzero(np.diff(crossed[moments].astype(int))))
-    return Association(_exchanged(replace(tracks, score=score), crossed), swaps, len(double))
-
-
-def _size(tracks: HandTracks, seen: np.ndarray) -> float:
-    """Median extent of a hand, px; at least 1."""
-    shown = tracks.image[..., :2][seen]
-    return max(float(np.median(np.ptp(shown, axis=1).max(axis=1))), 1.0) if len(shown) else 1.0
-
-
-def _doubles(tracks: HandTracks, seen: np.ndarray, size: float) -> np.ndarray:
-    """Frames in which both rows show one hand."""
-    both = np.flatnonzero(seen.all(axis=0))
-    apart = tracks.image[0, both, :, :2] - tracks.image[1, both, :, :2]
-    return both[np.linalg.norm(apart, axis=-1).mean(axis=1) < _SAME_HAND * size]
+    exchanged = {
+        name: np.where(crossed.reshape(-1, *[1] * (rows.ndim - 2)), rows[::-1], rows)
+        for name, rows in replace(tracks, score=score).arrays.items()
+    }
+    return Association(HandTracks(**exchanged, size=tracks.size), swaps, len(double))
 
 
 def _crossed(tracks: HandTracks, seen: np.ndarray, size: float) -> np.ndarray:
@@ -258,11 +247,8 @@ def _crossed(tracks: HandTracks, seen: np.ndarray, size: float) -> np.ndarray:
         following = []
         for state in (0, 1):
             # In state 0 the first row is the right hand.
-            sides = [row ^ state for row in rows]
-            vote = sum(
-                float(votes[row, frame, side]) for row, side in zip(rows, sides, strict=True)
-            )
-            shown = [(side, places[row, frame]) for row, side in zip(rows, sides, strict=True)]
+            vote = sum(float(votes[row, frame, row ^ state]) for row in rows)
+            shown = [(row ^ state, places[row, frame]) for row in rows]
             costs = [path.cost + vote + _motion(path, shown, frame, size) for path in paths]
             # Of equal ways the one without an exchange is taken.
             best = state if costs[state] <= costs[1 - state] else 1 - state
@@ -302,23 +288,6 @@ def _moved(path: _Path, cost: float, shown: list[tuple[int, np.ndarray]], frame:
     return _Path(cost, places, speeds, (frames[0], frames[1]))
 
 
-def _exchanged(tracks: HandTracks, crossed: np.ndarray) -> HandTracks:
-    """Exchange the rows of some frames."""
-
-    def rows(values: np.ndarray) -> np.ndarray:
-        where = crossed.reshape(1, -1, *[1] * (values.ndim - 2))
-        return np.where(where, values[::-1], values)
-
-    return replace(
-        tracks,
-        image=rows(tracks.image),
-        world=rows(tracks.world),
-        score=rows(tracks.score),
-        right=rows(tracks.right),
-        track=rows(tracks.track),
-    )
-
-
 def read_association(path: str | os.PathLike[str]) -> Association | None:
     """Read the hands of a file and associate them; None for a file that says nothing of sides."""
     tracks = read_hand_tracks(path)
@@ -330,19 +299,16 @@ def read_association(path: str | os.PathLike[str]) -> Association | None:
 
 @dataclass(frozen=True)
 class Landmarks:
-    """Landmarks of one hand in every frame of a video.
+    """Landmarks of one hand in every frame of a video."""
 
-    Attributes:
-        image: (F, 21, 2) float64, x and y in pixels of the whole frame (centres at +0.5).
-        world: (F, 21, 3) float64, metres, x right, y down, z away from the camera; the origin is
-            near the hand's centre and the scale is the tracker's guess.
-        score: (F,) float64, the tracker's confidence in [0, 1].
-        detected: (F,) bool, frames whose landmarks can be used.
-    """
-
+    #: (F, 21, 2) float64, x and y in pixels of the whole frame (centres at +0.5).
     image: np.ndarray
+    #: (F, 21, 3) float64, metres, x right, y down, z away from the camera; the origin is near the
+    #: hand's centre and the scale is the tracker's guess.
     world: np.ndarray
+    #: (F,) float64, the tracker's confidence in [0, 1].
     score: np.ndarray
+    #: (F,) bool, frames whose landmarks can be used.
     detected: np.ndarray
 
     @property
@@ -353,23 +319,31 @@ class Landmarks:
 
     def select(self, frames: np.ndarray) -> Landmarks:
         """Return the landmarks of some frames."""
-        return Landmarks(
-            self.image[frames], self.world[frames], self.score[frames], self.detected[frames]
-        )
+        return Landmarks(*(values[frames] for values in vars(self).values()))
 
 
 def read_landmarks(
     path: str | os.PathLike[str], *, min_score: float, side: str | None = None
 ) -> Landmarks:
-    """Read a tracker's npz file.
+    """Read a tracker's npz with `image` (F, 21, 2 or 3), `world` (F, 21, 3) and `score` (F,).
 
-    Args:
-        path: npz with `image` (F, 21, 2 or 3), `world` (F, 21, 3) and `score` (F,). A frame in
-            which the tracker saw nothing has score 0; its landmarks may be NaN.
+    A frame in which the tracker saw nothing has score 0; its landmarks may be NaN.
     """
-    path = Path(path)
-    arrays = _load(path, side)
-    image, world, score = (_floats(path, arrays, name) for name in ("image", "world", "score"))
+    path, arrays = Path(path), read_npz(path)
+    tracks = None if side is None else _tracks_of(arrays, path)
+    if tracks is not None and side is not None:
+        found = associate(tracks)
+        hand = found.row(side)
+        if hand is not None:
+            arrays = {name: found.tracks.arrays[name][hand] for name in _NAMES}
+    missing = [name for name in _NAMES if name not in arrays]
+    if missing:
+        raise BadInput(f"lacks the arrays {', '.join(missing)}", where=path)
+    for name in _NAMES:
+        if arrays[name].dtype.kind not in "fiu":
+            said = f"holds {arrays[name].dtype}, expected numbers"
+            raise BadInput(said, where=path, field=name)
+    image, world, score = (arrays[name].astype(np.float64) for name in _NAMES)
     frames = len(score) if score.ndim == 1 else -1
     if frames < 1:
         raise BadInput(f"has shape {score.shape}, expected (frames,)", where=path, field="score")
@@ -403,13 +377,7 @@ def read_landmarks(
             field="score",
             remedy="Track a hand first, or lower --min-score.",
         )
-    _check_metres(path, world[detected])
-    usable = detected[:, None, None]
-    return Landmarks(np.where(usable, image, 0.0), np.where(usable, world, 0.0), score, detected)
-
-
-def _check_metres(path: Path, world: np.ndarray) -> None:
-    extent = np.median(np.ptp(world, axis=1).max(axis=1))
+    extent = np.median(np.ptp(world[detected], axis=1).max(axis=1))
     low, high = HAND_METRES
     if not low <= extent <= high:
         raise BadInput(
@@ -418,6 +386,8 @@ def _check_metres(path: Path, world: np.ndarray) -> None:
             field="world",
             remedy=f"World landmarks are metres; a hand spans {low:g} to {high:g}.",
         )
+    usable = detected[:, None, None]
+    return Landmarks(np.where(usable, image, 0.0), np.where(usable, world, 0.0), score, detected)
 
 
 def check_against_video(
@@ -447,25 +417,4 @@ def check_against_video(
             field="image",
             remedy="Landmarks are in pixels of the whole frame, not in [0, 1].",
         )
-    return Landmarks(landmarks.image, landmarks.world, landmarks.score, detected)
-
-
-def _load(path: Path, side: str | None) -> dict[str, np.ndarray]:
-    arrays = read_npz(path)
-    tracks = None if side is None else _tracks_of(arrays, path)
-    if tracks is not None and side is not None:
-        found = associate(tracks)
-        hand = found.row(side)
-        if hand is not None:
-            names = ("image", "world", "score")
-            return {name: getattr(found.tracks, name)[hand] for name in names}
-    missing = [name for name in ("image", "world", "score") if name not in arrays]
-    if missing:
-        raise BadInput(f"lacks the arrays {', '.join(missing)}", where=path)
-    return arrays
-
-
-def _floats(path: Path, arrays: dict[str, np.ndarray], name: str) -> np.ndarray:
-    if arrays[name].dtype.kind not in "fiu":
-        raise BadInput(f"holds {arrays[name].dtype}, expected numbers", where=path, field=name)
-    return arrays[name].astype(np.float64)
+    return replace(landmarks, detected=detected)

@@ -1,11 +1,12 @@
-"""The output of an import: the capture, a sheet to look at, and the import's own report."""
+"""What imports have in common: checks of choices, hands, the capture, its sheet and report."""
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -15,12 +16,17 @@ import torch
 from hwp_bench.base.arrays import evenly
 from hwp_bench.base.console import progress
 from hwp_bench.base.drawing import labelled, outlined, sheet
+from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import refuse_existing as refuse_folder
-from hwp_bench.capture import Cameras, CaptureInfo, CaptureWriter
-from hwp_bench.hands import HandParameters, HandTemplate, PosedHand, pose_hand, project
+from hwp_bench.capture import Cameras, CaptureInfo, CaptureWriter, identify_hand_model
+from hwp_bench.hands import HandParameters, HandTemplate, project
+from hwp_bench.hands.fitting import FitTargets, FittedHand, fit_hand
+from hwp_bench.hands.raster import draw_bones, draw_dots, fixed_point
+from hwp_bench.hands.skinning import pose_parameters
 from hwp_bench.importers.shared.frames import each_frame
-from hwp_bench.importers.shared.landmarks import LANDMARK_EDGES
 
+#: The hands that can be asked for; `auto`: those that the data show.
+CHOICES = ("auto", "right", "left", "both")
 #: Name of the overlay sheet among the capture's extra files.
 SHEET_NAME = "overlay.png"
 #: Name of the report among the capture's extra files.
@@ -29,8 +35,37 @@ REPORT_NAME = "import.json"
 _MESH = (120, 150, 255)
 # Bones of the fitted model, and landmarks of the tracker.
 _FITTED, _TRACKED = (255, 160, 0), (255, 255, 255)
-# Bits of fractions of a pixel in what OpenCV draws.
-_SHIFT = 4
+
+
+def check_choices(*rules: tuple[str, bool, str]) -> None:
+    """Refuse the first choice that makes no sense: its option, whether it does, what it must be."""
+    for option, good, problem in rules:
+        if not good:
+            raise UsageError(problem, field=option)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReleaseImport:
+    """Choices of an import of a data set; checked when made.
+
+    Raises:
+        UsageError: a choice makes no sense.
+    """
+
+    #: MANO file or folder, or None to fit the free hand.
+    mano: Path | None = None
+    #: Edge of the stored square frames, px.
+    size: int = 256
+    #: Replace an existing capture.
+    overwrite: bool = False
+
+    def __post_init__(self) -> None:
+        check_choices(("--size", 32 <= self.size <= 2048, "must be 32 to 2048 px"))
+
+    @property
+    def model(self) -> str:
+        """The hand model, as `load_template` takes it."""
+        return "anny" if self.mano is None else f"mano:{Path(self.mano).absolute()}"
 
 
 def refuse_existing(out: str | os.PathLike[str], *, overwrite: bool) -> None:
@@ -38,41 +73,18 @@ def refuse_existing(out: str | os.PathLike[str], *, overwrite: bool) -> None:
     refuse_folder(out, overwrite=overwrite, flag="--force")
 
 
-def write_capture(
-    out: str | os.PathLike[str],
-    info: CaptureInfo,
-    hands: Mapping[str, HandParameters],
-    cameras: Cameras,
-    frames: Iterable[tuple[np.ndarray, np.ndarray]],
-    sheet: Callable[[], np.ndarray],
-    facts: Mapping[str, Any],
-    *,
-    overwrite: bool,
-) -> None:
-    """Write a capture, whole or not at all.
-
-    Args:
-        frames: for each frame its image (H, W, 3) uint8 sRGB and its mask (H, W) uint8.
-        sheet: draws the overlay sheet, (H, W, 3) uint8; called once all frames are written.
-    """
-    with (
-        CaptureWriter(out, info, hands, cameras, overwrite=overwrite) as writer,
-        progress("writing the capture", info.frame_count) as update,
-    ):
-
-        def store(numbered: tuple[int, tuple[np.ndarray, np.ndarray]]) -> int:
-            frame, (image, mask) = numbered
-            writer.frame(frame, image)
-            writer.mask(frame, mask)
-            return frame
-
-        for frame in each_frame(store, enumerate(frames)):
-            update(frame + 1)
-        writer.extra(SHEET_NAME, cv2.imencode(".png", sheet()[:, :, ::-1])[1].tobytes())
-        writer.extra(REPORT_NAME, json.dumps(dict(facts), indent=1) + "\n")
-
-
-# --- The overlay sheet
+def fit_free_hand(
+    template: HandTemplate,
+    pose: np.ndarray,
+    valid: np.ndarray,
+    knuckle: np.ndarray,
+    targets: FitTargets,
+) -> FittedHand:
+    """Fit a hand to targets, from a pose (F, 16, 3) with the middle knuckle at (F, 3) m."""
+    unplaced = HandParameters(pose, np.zeros(10), np.zeros((len(pose), 3)), valid)
+    shift = knuckle - pose_parameters(template, unplaced).landmarks[:, 9].numpy()
+    start = replace(unplaced, transl=np.where(valid[:, None], shift, 0.0))
+    return fit_hand(template, targets, start)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,72 +103,102 @@ class ProjectedHand:
     valid: np.ndarray
 
 
-def pose_parameters(template: HandTemplate, hand: HandParameters) -> PosedHand:
-    """Pose a hand in every frame, in float64."""
-    with torch.no_grad():
-        return pose_hand(
-            template.to_torch(torch.float64),
-            torch.from_numpy(hand.pose),
-            torch.from_numpy(hand.betas),
-            torch.from_numpy(hand.transl),
-        )
-
-
 def project_hand(template: HandTemplate, hand: HandParameters, cameras: Cameras) -> ProjectedHand:
     """Pose a hand in every frame and project it."""
     viewmats, Ks = torch.from_numpy(cameras.viewmats), torch.from_numpy(cameras.Ks)
     posed = pose_parameters(template, hand)
-    with torch.no_grad():
-        pixels, _ = project(posed.vertices, viewmats, Ks)
-        landmarks, _ = project(posed.landmarks, viewmats, Ks)
-        vertices = posed.vertices @ viewmats[:, :3, :3].mT + viewmats[:, None, :3, 3]
+    pixels, landmarks = (project(p, viewmats, Ks)[0] for p in (posed.vertices, posed.landmarks))
+    vertices = posed.vertices @ viewmats[:, :3, :3].mT + viewmats[:, None, :3, 3]
     return ProjectedHand(
         vertices.numpy(), pixels.numpy(), landmarks.numpy(), template.faces, hand.valid
     )
 
 
-def sheet_frames(count: int, most: int = 12) -> list[int]:
-    """Return evenly spaced frames for a sheet, at most `most` of `count`."""
-    return evenly(count, most).tolist()
-
-
-def overlay_sheet(
-    hands: Sequence[ProjectedHand],
-    images: Mapping[int, np.ndarray],
-    masks: Mapping[int, np.ndarray],
-    tracked: Mapping[int, np.ndarray] | None = None,
-    captions: Mapping[int, str] | None = None,
+def write_capture(
+    out: str | os.PathLike[str],
+    hands: Mapping[str, HandParameters],
+    cameras: Cameras,
+    frames: Iterable[tuple[np.ndarray, np.ndarray]],
+    clips: Sequence[ProjectedHand],
+    facts: Mapping[str, Any],
+    *,
+    overwrite: bool,
+    model: str,
+    size: int,
+    tracked: np.ndarray | None = None,
+    captions: Sequence[str] | None = None,
+    most: int = 12,
+    **about: Any,
 ) -> np.ndarray:
-    """Draw frames with the outline of their masks, with the posed meshes next to them.
+    """Write a capture, whole or not at all, and return its overlay sheet, (H, W, 3) uint8.
 
     Args:
-        images: (S, S, 3) uint8 by frame.
-        masks: (S, S) uint8 by frame.
-        tracked: (N, 2) px by frame, points that are drawn as dots, NaN where unknown.
-
-    Returns:
-        (H, W, 3) uint8.
+        frames: for each frame its image (S, S, 3) uint8 sRGB and its mask (S, S) uint8.
+        clips: the hands, as they are drawn on the sheet.
+        facts: the import's report.
+        model: the hand model, as `load_template` takes it.
+        size: S, px.
+        tracked: (F, N, 2) px, points that the sheet shows as dots, NaN where unknown.
+        captions: of the frames on the sheet, of which there are at most `most`.
+        about: everything else that `CaptureInfo` says.
     """
-    faces, offset = [], 0
-    for hand in hands:
-        faces.append(hand.faces + offset)
-        offset += hand.vertices.shape[1]
-    tiles = []
-    for frame, image in images.items():
-        # Triangles of no size are not drawn, so a hand that is not visible does not appear.
-        vertices = np.concatenate([hand.vertices[frame] * hand.valid[frame] for hand in hands])
-        pixels = np.concatenate([hand.pixels[frame] for hand in hands])
-        drawn = _draw_mesh(image, vertices, pixels, np.concatenate(faces))
-        for hand in hands:
-            if hand.valid[frame]:
-                _draw_bones(drawn, hand.landmarks[frame])
-        if tracked is not None:
-            dots = tracked[frame]
-            for x, y in _fractions(dots[np.isfinite(dots).all(axis=1)]):
-                cv2.circle(drawn, (x, y), 3 << _SHIFT - 1, _TRACKED, -1, cv2.LINE_AA, _SHIFT)
-        pair = np.concatenate([outlined(image, masks[frame]), drawn], axis=1)
-        tiles.append(labelled(pair, f"frame {frame}" if captions is None else captions[frame]))
-    return sheet(tiles, columns=4)
+    count, shown = len(cameras), "both" if len(hands) == 2 else next(iter(hands))
+    info = CaptureInfo(
+        hands=shown,
+        width=size,
+        height=size,
+        frame_count=count,
+        hand_model=identify_hand_model(model, shown),
+        **about,
+    )
+    kept: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+    on_sheet = evenly(count, most).tolist()
+    with (
+        CaptureWriter(out, info, hands, cameras, overwrite=overwrite) as writer,
+        progress("writing the capture", count) as update,
+    ):
+
+        def store(numbered: tuple[int, tuple[np.ndarray, np.ndarray]]) -> int:
+            frame, (image, mask) = numbered
+            writer.frame(frame, image)
+            writer.mask(frame, mask)
+            if frame in on_sheet:
+                kept[frame] = image, mask
+            return frame
+
+        for frame in each_frame(store, enumerate(frames)):
+            update(frame + 1)
+        tiles = []
+        for frame in on_sheet:
+            image, mask = kept[frame]
+            drawn = _draw_hands(image, clips, frame, None if tracked is None else tracked[frame])
+            caption = f"frame {frame}" if captions is None else captions[frame]
+            pair = np.concatenate([outlined(image, mask), drawn], axis=1)
+            tiles.append(labelled(pair, caption))
+        overview = sheet(tiles, columns=4)
+        writer.extra(SHEET_NAME, cv2.imencode(".png", overview[:, :, ::-1])[1].tobytes())
+        writer.extra(REPORT_NAME, json.dumps(dict(facts), indent=1) + "\n")
+    return overview
+
+
+def _draw_hands(
+    image: np.ndarray, clips: Sequence[ProjectedHand], frame: int, dots: np.ndarray | None
+) -> np.ndarray:
+    """Draw the meshes, the bones and the dots (N, 2) px of a frame over it."""
+    faces, count = [], 0
+    for clip in clips:
+        faces.append(clip.faces + count)
+        count += clip.vertices.shape[1]
+    # Triangles of no size are not drawn, so a hand that is not visible does not appear.
+    vertices = np.concatenate([clip.vertices[frame] * clip.valid[frame] for clip in clips])
+    pixels = np.concatenate([clip.pixels[frame] for clip in clips])
+    drawn = _draw_mesh(image, vertices, pixels, np.concatenate(faces))
+    for clip in clips:
+        if clip.valid[frame]:
+            draw_bones(drawn, clip.landmarks[frame], _FITTED)
+    if dots is not None:
+        draw_dots(drawn, dots[np.isfinite(dots).all(axis=1)], _TRACKED, 1.5)
+    return drawn
 
 
 def _draw_mesh(
@@ -168,22 +210,11 @@ def _draw_mesh(
     middles = triangles.mean(axis=1)
     lengths = np.linalg.norm(normals, axis=1) * np.linalg.norm(middles, axis=1)
     facing = -(normals * middles).sum(axis=1) / np.maximum(lengths, 1e-20)
-    corners = np.array(_fractions(pixels), dtype=np.int32)
+    places, shift = fixed_point(pixels)
+    corners = np.array(places, dtype=np.int32)
     layer = image.copy()
     for face in np.argsort(-middles[:, 2]):
         if facing[face] > 0:
             shade = tuple((0.35 + 0.65 * facing[face]) * np.array(_MESH))
-            cv2.fillConvexPoly(layer, corners[faces[face]], shade, cv2.LINE_8, _SHIFT)
+            cv2.fillConvexPoly(layer, corners[faces[face]], shade, cv2.LINE_8, shift)
     return cv2.addWeighted(layer, 0.6, image, 0.4, 0)
-
-
-def _draw_bones(canvas: np.ndarray, landmarks: np.ndarray) -> None:
-    spots = _fractions(landmarks)
-    for first, last in LANDMARK_EDGES:
-        cv2.line(canvas, spots[first], spots[last], _FITTED, 1, cv2.LINE_AA, _SHIFT)
-
-
-def _fractions(pixels: np.ndarray) -> list[tuple[int, int]]:
-    """Places as OpenCV draws them, in fractions of a pixel with integers at its centre."""
-    scaled = np.clip((pixels - 0.5) * 2**_SHIFT, -(2**20), 2**20).round().astype(int)
-    return [(x, y) for x, y in scaled.tolist()]

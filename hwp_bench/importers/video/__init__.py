@@ -1,7 +1,6 @@
 """A video of one hand or two and the tracked landmarks: frames, fit, masks, capture."""
 
-from hwp_bench.importers.video.api import import_video, read_finished_import
-from hwp_bench.importers.video.clip import ImportedClip
+from hwp_bench.importers.video.api import ImportedClip, import_video, read_finished_import
 from hwp_bench.importers.video.decode import FrameRange, parse_frame_range
 from hwp_bench.importers.video.solve import FitSettings
 from hwp_bench.importers.video.source import VideoImport

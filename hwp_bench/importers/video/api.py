@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import os
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,17 +15,23 @@ import numpy as np
 from hwp_bench.base.console import notice, progress
 from hwp_bench.base.errors import BadInput, UsageError, bounded
 from hwp_bench.base.files import atomic_write, read_json, sha256_file, sha256_json
-from hwp_bench.base.images import is_blank
-from hwp_bench.capture.schema import EXTRA, METADATA, check_id
-from hwp_bench.hands import load_template
+from hwp_bench.base.images import is_blank, write_image
+from hwp_bench.capture.schema import EXTRA, METADATA, Cameras, check_id
+from hwp_bench.hands import HandParameters, load_template
+from hwp_bench.hands.skeleton import SIDES
 from hwp_bench.importers.shared.landmarks import Landmarks
-from hwp_bench.importers.shared.output import REPORT_NAME, SHEET_NAME, refuse_existing
-from hwp_bench.importers.video.clip import ImportedClip, ImportedHand, store_clip
+from hwp_bench.importers.shared.output import (
+    REPORT_NAME,
+    SHEET_NAME,
+    refuse_existing,
+    write_capture,
+)
 from hwp_bench.importers.video.masks import (
     NARROW,
     WIDE,
     ClipMasks,
     MaskSettings,
+    ProjectedClip,
     ProjectedHands,
     cut_masks,
     project_clip,
@@ -42,19 +50,130 @@ from hwp_bench.importers.video.solve import (
     share_camera,
 )
 from hwp_bench.importers.video.source import (
+    LOW_OVERLAP,
     VideoImport,
     VideoSource,
+    fit_warnings,
     landmark_doubts,
     read_source,
     refuse_other_units,
     refuse_unfitted,
 )
-from hwp_bench.taxonomy import perturbation
 
+#: Version of the fit and the masks. It is raised when they come out otherwise for the same input,
+#: because scores on captures of two versions do not compare.
+IMPORTER_VERSION = 3
+#: Frames on the overlay sheet.
+SHEET_FRAMES = 24
 #: Endings of the names of images that a sheet can be written to.
 SHEET_KINDS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 #: A frame whose landmarks are missed by more than this share of the hand's size is not valid.
 FAILED_FIT = 0.10
+
+
+@dataclass(frozen=True, eq=False)
+class ImportedHand:
+    """One hand of an import."""
+
+    #: The tracker's.
+    landmarks: Landmarks
+    #: Pose, shape and place.
+    parameters: HandParameters
+    #: The fit, and the fit in the images.
+    fitted: FittedClip
+    projected: ProjectedClip
+    #: Reprojection error of the final fit, and before the outline was fitted.
+    error: ReprojectionError
+    error_landmarks_only: ReprojectionError
+
+    def facts(self) -> dict[str, object]:
+        """Return the numbers that measure the fit of this hand, as JSON."""
+
+        def pixels(error: ReprojectionError) -> dict[str, object]:
+            values = {key: value for key, value in asdict(error).items() if key != "by_frame"}
+            return {k: round(v, 3) if isinstance(v, float) else v for k, v in values.items()}
+
+        size = self.fitted.model.variables.log_size.detach().exp()
+        return {
+            "frames_detected": int(self.landmarks.detected.sum()),
+            "frames_valid": int(self.parameters.valid.sum()),
+            "reprojection_px": pixels(self.error),
+            "reprojection_px_landmarks_only": pixels(self.error_landmarks_only),
+            "depth_m": [
+                round(float(z), 3) for z in np.percentile(self.parameters.transl[:, 2], (0, 100))
+            ],
+            "world_scale": round(float(size), 4),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class ImportedClip:
+    """The results of an import."""
+
+    #: The inputs.
+    source: VideoSource
+    #: By side, the hand that is detected most first.
+    hands: Mapping[str, ImportedHand]
+    #: Final masks, of all hands.
+    masks: ClipMasks
+    #: Mean overlap of mesh and mask before the outline was fitted.
+    overlap_landmarks_only: float
+    #: What tells against the landmarks.
+    doubts: tuple[str, ...] = ()
+
+    @property
+    def overlap(self) -> float:
+        """Mean overlap of mesh and mask in the frames that show a hand."""
+        return float(self.masks.overlap[self.source.detected].mean())
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Things to know before the capture is used; empty for a sound clip."""
+        fitted = {side: hand.parameters.valid for side, hand in self.hands.items()}
+        seen = {side: hand.landmarks.detected for side, hand in self.hands.items()}
+        said = [*self.doubts, *fit_warnings(fitted, seen)]
+        if self.overlap < LOW_OVERLAP:
+            said.append(
+                f"the overlap of mesh and mask is {self.overlap:.2f}, of a sound clip 0.9 and more"
+            )
+        return tuple(said)
+
+    @property
+    def first(self) -> ImportedHand:
+        """The hand that is detected most."""
+        return next(iter(self.hands.values()))
+
+    @property
+    def shown(self) -> str:
+        """The hands as a capture names them: `right`, `left` or `both`."""
+        return "both" if len(self.hands) == 2 else next(iter(self.hands))
+
+    @property
+    def focal(self) -> float:
+        """Focal length, px of the whole frame; the same for all hands."""
+        return float(self.first.fitted.model.focal.detach())
+
+    def facts(self) -> dict[str, object]:
+        """Return the numbers that measure the import, as JSON; of two hands each has its own."""
+        seen = self.source.detected
+        overlaps = self.masks.overlap[seen]
+        common: dict[str, object] = {
+            "frames": len(seen),
+            "overlap": round(self.overlap, 4),
+            "overlap_percentile_5": round(float(np.percentile(overlaps, 5)), 4),
+            "overlap_landmarks_only": round(self.overlap_landmarks_only, 4),
+            "focal_px": round(self.focal, 2),
+        }
+        reading = self.source.reading and self.source.reading.warning()
+        warnings = [f"the video {reading}"] if reading else []
+        warnings += self.warnings
+        if warnings:
+            common["warnings"] = warnings
+        if len(self.hands) == 1:
+            return {**common, **self.first.facts()}
+        each = {side: hand.facts() for side, hand in self.hands.items()}
+        repaired = {"swaps_repaired": self.source.swaps, "doubles_left_out": self.source.doubles}
+        return {**common, **repaired, "hands": each}
 
 
 def import_video(
@@ -138,19 +257,16 @@ def _call(
 def drop_blank_frames(source: VideoSource) -> VideoSource:
     """The same clip; no hand counts as detected in a frame of one colour, such as a black one."""
     blank = np.array([is_blank(frame) for frame in source.images.frames])
-    hands = {
-        side: replace(hand, detected=hand.detected & ~blank) for side, hand in source.hands.items()
-    }
-    wrong = np.flatnonzero(source.detected & blank)
+    wrong = source.indices[source.detected & blank]
     if not len(wrong):
         return source
-    numbers = [int(source.indices[frame]) for frame in wrong]
-    notice(f"warning: no hand is taken from frames of one colour: {bounded(numbers)}.")
-    for side, hand in hands.items():
-        if not hand.detected.any():
-            raise BadInput(
-                f"the {side} hand is detected in frames of one colour only", where=source.video.path
-            )
+    notice(f"warning: no hand is taken from frames of one colour: {bounded(wrong.tolist())}.")
+    hands = {}
+    for side, hand in source.hands.items():
+        hands[side] = replace(hand, detected=hand.detected & ~blank)
+        if not hands[side].detected.any():
+            said = f"the {side} hand is detected in frames of one colour only"
+            raise BadInput(said, where=source.video.path)
     return replace(source, hands=hands)
 
 
@@ -164,9 +280,7 @@ def fit_video(
     """
     hands = list(source.hands.values())
     fits = _fit_hands(source, options)
-    first_errors = [
-        reprojection_error(fitted, hand) for fitted, hand in zip(fits, hands, strict=True)
-    ]
+    first_errors = list(map(reprojection_error, fits, hands))
     good = map(follow_landmarks, first_errors, hands)
     refuse_unfitted(dict(zip(source.hands, good, strict=True)), source, doubts)
     turns = _Turns(source, options, fits)
@@ -198,24 +312,27 @@ def follow_landmarks(error: ReprojectionError, landmarks: Landmarks) -> np.ndarr
     return np.asarray(landmarks.detected & ~missed)
 
 
+@contextmanager
+def _steps(title: str, total: int) -> Iterator[Callable[[], None]]:
+    """Show the progress of work that calls what it is given after each of its steps."""
+    count = itertools.count(1)
+    with progress(title, total) as update:
+        yield lambda: update(next(count))
+
+
 def _fit_hands(source: VideoSource, options: VideoImport) -> list[FittedClip]:
     """Fit the landmarks of each hand, then both to one camera."""
     settings, video = options.fit, source.video
     footage = Footage(video.width, video.height, video.fps / options.frames.stride, options.focal)
     steps = settings.start_steps + settings.landmark_steps
-    fits: list[FittedClip] = []
-    with progress("fitting landmarks", steps * len(source.hands)) as update:
-        for side, landmarks in source.hands.items():
-            template = load_template(options.hand_model, side)
-            later = _counting_on(update, steps * len(fits))
-            fits.append(fit_landmarks(landmarks, template, footage, settings, later))
+    with _steps("fitting landmarks", steps * len(source.hands)) as step:
+        fits = [
+            fit_landmarks(hand, load_template(options.hand_model, side), footage, settings, step)
+            for side, hand in source.hands.items()
+        ]
     if len(fits) == 2 and options.focal is None:
         share_camera(fits, steps=settings.landmark_steps // 3)
     return fits
-
-
-def _counting_on(update: Callable[[int], None], done: int) -> Callable[[int], None]:
-    return lambda more: update(done + more)
 
 
 class _Turns:
@@ -239,16 +356,8 @@ class _Turns:
         with progress(title, len(source.indices)) as update:
             clips = [project_clip(fitted.model, source.windows) for fitted in self._fits]
             projected = ProjectedHands(clips, self._landmarks)
-            masks = cut_masks(
-                images,
-                projected,
-                source.detected,
-                size,
-                trust,
-                own=source.own_masks,
-                reduction=reduction,
-                update=update,
-            )
+            seen, own = source.detected, source.own_masks
+            masks = cut_masks(images, projected, seen, size, trust, own, reduction, update)
         return projected, masks
 
     def fit_outlines(
@@ -258,9 +367,8 @@ class _Turns:
         windows = self._source.windows
         steps = self._settings.contour_rounds * self._settings.contour_steps
         self._outlines += 1
-        with progress(
-            f"fitting outlines ({self._outlines} of 2)", steps * len(self._fits)
-        ) as update:
+        title = f"fitting outlines ({self._outlines} of 2)"
+        with _steps(title, steps * len(self._fits)) as step:
             pictures = self._pictures(projected, masks) if texture else None
             for hand, (fitted, landmarks) in enumerate(
                 zip(self._fits, self._landmarks, strict=True)
@@ -270,17 +378,15 @@ class _Turns:
                 ignored = projected.covered(hand, REACH * size * FIELD_SIZE / windows.side)
                 outline = OutlineResidual(masks.fields, landmarks.detected, windows, size, ignored)
                 more = [] if pictures is None else [TextureResidual(pictures[hand], fitted.model)]
-                later = _counting_on(update, hand * steps)
-                fit_outline(fitted, outline, *more, update=later)
+                fit_outline(fitted, outline, *more, tick=step)
 
     def fit_pictures(self, projected: ProjectedHands, masks: ClipMasks) -> None:
         """Refine the hands' poses by whole pictures."""
         steps = self._settings.picture_rounds * PICTURE_STEPS
-        with progress("fitting pictures", steps * len(self._fits)) as update:
+        with _steps("fitting pictures", steps * len(self._fits)) as step:
             pictures = self._pictures(projected, masks)
-            for hand, fitted in enumerate(self._fits):
-                residual = PictureResidual(pictures[hand], fitted.model)
-                fit_picture(fitted, residual, _counting_on(update, hand * steps))
+            for picture, fitted in zip(pictures, self._fits, strict=True):
+                fit_picture(fitted, PictureResidual(picture, fitted.model), step)
 
     def _pictures(self, projected: ProjectedHands, masks: ClipMasks) -> list[HandPictures]:
         """The frames as the fit of each hand sees them."""
@@ -302,8 +408,6 @@ def _check_output(out: Path, options: VideoImport) -> None:
     """Check the output before minutes of work, not after them."""
     refuse_existing(out, overwrite=options.overwrite)
     check_id(options.capture_id(out), os.fspath(out))
-    for name in options.perturbations:
-        perturbation(name)
     sheet = options.sheet
     if sheet is None:
         return
@@ -312,3 +416,90 @@ def _check_output(out: Path, options: VideoImport) -> None:
         raise UsageError(f"must end in one of {kinds}", where=sheet, field="--sheet")
     if sheet.is_dir() or any(part.is_file() for part in sheet.parents):
         raise UsageError("cannot be written there", where=sheet, field="--sheet")
+
+
+# --- The capture
+
+
+def store_clip(
+    clip: ImportedClip, out: str | os.PathLike[str], options: VideoImport, call: str
+) -> None:
+    """Write the capture, whole or not at all, and the separate sheet where one is asked for.
+
+    `call` is the digest of the call that makes it, by which a second one knows that it is complete.
+    """
+    source, facts = clip.source, clip.facts()
+    video, windows = source.video, source.windows
+    count = len(source.indices)
+    middle = (video.width / 2, video.height / 2)
+    K = np.array([[clip.focal, 0, middle[0]], [0, clip.focal, middle[1]], [0, 0, 1.0]])
+    overview = write_capture(
+        out,
+        {side: clip.hands[side].parameters for side in SIDES if side in clip.hands},
+        Cameras(windows.intrinsics(K), np.tile(np.eye(4), (count, 1, 1))),
+        zip(source.images.frames, clip.masks.coverage, strict=True),
+        [hand.projected.drawn() for hand in clip.hands.values()],
+        {**facts, "call": call},
+        overwrite=options.overwrite,
+        model=options.hand_model,
+        size=windows.size,
+        tracked=_tracked_points(clip),
+        captions=[_caption(clip, frame) for frame in range(count)],
+        most=SHEET_FRAMES,
+        id=options.capture_id(out),
+        action=options.action,
+        device=options.device,
+        fps=video.fps / options.frames.stride,
+        perturbations=dict.fromkeys(options.perturbations),
+        source={
+            "kind": "video",
+            "importer": {"name": "video", "version": IMPORTER_VERSION},
+            "video": {
+                "name": video.path.name,
+                "sha256": sha256_file(video.path),
+                "width": video.width,
+                "height": video.height,
+                "fps": video.fps,
+                "codec": video.codec,
+                "colours": video.colours,
+                **({} if source.reading is None else source.reading.facts()),
+            },
+            "landmarks": {
+                "name": source.landmarks_path.name,
+                "sha256": sha256_file(source.landmarks_path),
+            },
+            "frames": source.indices.tolist(),
+            "crop": {"side": windows.side, "corners": windows.corners.tolist()},
+            "focal": {"px": clip.focal, "from": "estimate" if options.focal is None else "user"},
+            "masks": "graph cut" if source.own_masks is None else "user",
+            "fit": facts,
+        },
+        licence=options.licence,
+    )
+    if options.sheet is not None:
+        write_image(options.sheet, overview)
+
+
+def _tracked_points(clip: ImportedClip) -> np.ndarray:
+    """The tracker's landmarks in the crops, (F, N, 2) px; NaN where a hand is not detected."""
+    windows, points = clip.source.windows, []
+    for hand in clip.hands.values():
+        moved = windows.place(hand.landmarks.image)
+        points.append(np.where(hand.landmarks.detected[:, None, None], moved, np.nan))
+    return np.concatenate(points, axis=1)
+
+
+def _caption(clip: ImportedClip, frame: int) -> str:
+    """What the sheet says of a frame."""
+    number, reading = f"{clip.source.indices[frame]}", clip.source.reading
+    if reading is not None and reading.ends_early and frame == len(clip.source.indices) - 1:
+        # At the front: long captions are cut.
+        number += f" (video ends early: {reading.counted()})"
+    said = f"frame {number}: overlap {clip.masks.overlap[frame]:.2f}"
+    for hand in clip.hands.values():
+        if not hand.landmarks.detected[frame]:
+            said += ", not detected"
+            continue
+        valid = "" if hand.parameters.valid[frame] else ", not valid"
+        said += f", {hand.error.by_frame[frame]:.1f} px{valid}"
+    return said

@@ -125,7 +125,9 @@ def colours_of(frame: Any, tag: str, path: Path) -> Colours:
     if primaries in (0, _RESERVED):
         primaries = _UNSPECIFIED
     wide = primaries == 9 or (primaries == _UNSPECIFIED and matrix == 9)
-    if transfer == _UNSPECIFIED and _is_dolby_vision(frame, tag):
+    marks = {side.type.name for side in frame.side_data}
+    dolby = tag in _DOLBY_TAGS or not marks.isdisjoint(("DOVI_RPU_BUFFER", "DOVI_METADATA"))
+    if transfer == _UNSPECIFIED and dolby:
         raise _refused(path, "Dolby Vision without a picture for other decoders (profile 5)")
     if transfer == _UNSPECIFIED and wide:
         raise BadInput(
@@ -166,12 +168,6 @@ def _matrix(frame: Any, stated: int, expected: int | None, path: Path) -> int:
     return 1 if frame.width >= 1280 or frame.height > 576 else 6
 
 
-def _is_dolby_vision(frame: Any, tag: str) -> bool:
-    if tag in _DOLBY_TAGS:
-        return True
-    return any(side.type.name in ("DOVI_RPU_BUFFER", "DOVI_METADATA") for side in frame.side_data)
-
-
 def _refused(path: Path, what: str) -> BadInput:
     return BadInput(
         f"has colours that are not converted here: {what}",
@@ -194,11 +190,17 @@ def to_srgb(frame: Any, colours: Colours, size: tuple[int, int]) -> np.ndarray:
         return np.asarray(made.to_ndarray())
     flags = _bicubic(exact=True)
     made = frame.reformat(width, height, "yuv444p16le", interpolation=flags, threads=1)
-    planes = [_plane(plane, width, height) for plane in made.planes[:3]]
+    planes = [
+        np.frombuffer(plane, dtype="<u2").reshape(-1, plane.line_size // 2)[:height, :width]
+        for plane in made.planes[:3]
+    ]
+    # Black, the span of brightness and that of colour differences, in samples of 16 bits.
+    full = float((2**colours.bits - 1) << (16 - colours.bits))
+    levels = (0.0, full, full) if colours.full else (4096.0, 219.0 * 256.0, 224.0 * 256.0)
     out = np.empty((height, width, 3), dtype=np.uint8)
     red, blue, _ = _MATRICES[colours.matrix]
     tables = _tables(colours.transfer, colours.primaries)
-    convert(*planes, *_levels(colours), np.array([red, 1.0 - red - blue, blue]), *tables, out)
+    convert(*planes, *levels, np.array([red, 1.0 - red - blue, blue]), *tables, out)
     return out
 
 
@@ -208,19 +210,6 @@ def _bicubic(*, exact: bool) -> int:
     if not exact:
         return int(Flags.BICUBIC)
     return int(Flags.BICUBIC | Flags.ACCURATE_RND | Flags.FULL_CHR_H_INT | Flags.FULL_CHR_H_INP)
-
-
-def _plane(plane: Any, width: int, height: int) -> np.ndarray:
-    rows = np.frombuffer(plane, dtype="<u2").reshape(-1, plane.line_size // 2)
-    return rows[:height, :width]
-
-
-def _levels(colours: Colours) -> tuple[float, float, float]:
-    """Black, the span of brightness and that of colour differences, in samples of 16 bits."""
-    if colours.full:
-        span = float((2**colours.bits - 1) << (16 - colours.bits))
-        return 0.0, span, span
-    return 16.0 * 256.0, 219.0 * 256.0, 224.0 * 256.0
 
 
 @functools.lru_cache(maxsize=8)

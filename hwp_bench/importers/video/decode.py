@@ -155,16 +155,8 @@ def probe(path: str | os.PathLike[str]) -> VideoInfo:
                 where=path,
                 remedy=f"The file is damaged or cut off; if it plays elsewhere: {_AGAIN}",
             )
-        width, height = video.upright_size(frame)
-        return VideoInfo(
-            path=path,
-            width=width,
-            height=height,
-            fps=video.fps,
-            stated_frames=video.stated,
-            codec=video.codec,
-            colours=str(colours),
-        )
+        size = video.upright_size(frame)
+        return VideoInfo(path, *size, video.fps, video.stated, video.codec, str(colours))
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,17 +246,10 @@ def read_masks(
 def read_frames(
     info: VideoInfo, selection: FrameRange, ended: Callable[[Reading], None] | None = None
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """Decode the selected frames, one after the other.
+    """Decode the selected frames: yields the index in the video, and (H, W, 3) uint8 sRGB.
 
-    Args:
-        info: the probed video.
-        selection: which frames; those between are decoded and dropped, because seeking is not
-            exact in every container.
-        ended: is told what came of it when the video was read to its end, which a selection with
-            a `stop` does not do.
-
-    Yields:
-        (index in the video, (H, W, 3) uint8 sRGB).
+    Those between are decoded and dropped, because seeking is not exact in every container. `ended`
+    is told what came of it when the video was read to its end, which a `stop` prevents.
     """
     with _opened(info.path) as video:
         index = 0
@@ -300,13 +285,9 @@ _AGAIN = "ffmpeg -i VIDEO -c:v libx264 -crf 12 -pix_fmt yuv420p video.mp4"
 
 
 class _Video:
-    """An open file, and the stream of it that is the video.
+    """An open file, a container of PyAV's, and the stream of it that is the video.
 
-    Args:
-        path: the file, for messages.
-        container: PyAV's.
-        kind: key of `CONTAINERS`.
-        half_packet: whether the file ends within a packet of its container.
+    `kind` is a key of `CONTAINERS`; the file may end within a packet of its container.
     """
 
     def __init__(self, path: Path, container: Any, kind: str, *, half_packet: bool) -> None:
@@ -319,9 +300,18 @@ class _Video:
         self._stream.thread_type = "AUTO"
         aspect = float(self._stream.sample_aspect_ratio or 1)
         self._aspect = aspect if 1 / _MOST_ASPECT <= aspect <= _MOST_ASPECT else 1.0
-        self.fps = _rate(self._stream)
+        rates = [self._stream.average_rate, self._stream.guessed_rate, context.framerate]
+        if self._stream.time_base is not None and self._stream.time_base >= 1:
+            # Such a clock counts no frames.
+            rates = rates[2:]
+        #: Frames per second; 30 where the file states none that can be.
+        self.fps = next((float(rate) for rate in rates if rate and 0 < rate <= 1000), 30.0)
         self._packets, self._seconds, self._own = _expected(container, self._stream, kind)
-        self.stated: int = _stated_frames(self._stream, self._packets)
+        self.stated = int(self._stream.frames)
+        if self._packets is not None:
+            # An edit list may leave some out.
+            discarded = sum(entry.is_discard for entry in self._stream.index_entries)
+            self.stated = self._packets - discarded
         if self.stated <= 0 and self._seconds is not None:
             self.stated = max(0, min(round(self._seconds * self.fps), 2**31 - 1))
         # Half of a packet at the end, of a row of packets of one size.
@@ -366,17 +356,16 @@ class _Video:
                 return
             if packet.pts is not None and packet.size:
                 end = float((packet.pts + (packet.duration or 0)) * packet.time_base)
-                self._reached = max(self._reached, end - self._began(packet.stream))
+                # Less the second at which the time of the stream begins.
+                if self._own:
+                    began = float((packet.stream.start_time or 0) * packet.stream.time_base)
+                else:
+                    began = (self._container.start_time or 0) / _library().time_base
+                self._reached = max(self._reached, end - began)
             if packet.stream.index == own:
                 self._seen += packet.size > 0
                 self._damaged += bool(packet.is_corrupt)
                 yield packet
-
-    def _began(self, stream: Any) -> float:
-        """Second at which the time of a stream begins."""
-        if self._own:
-            return float((stream.start_time or 0) * stream.time_base)
-        return (self._container.start_time or 0) / _library().time_base
 
     def _colours(self, frame: Any) -> Colours:
         stated = (frame.colorspace, frame.color_primaries, frame.color_trc, frame.color_range)
@@ -408,10 +397,20 @@ class _Video:
         return width, height
 
     def _turned(self, frame: Any) -> tuple[bool, bool, bool]:
-        # Of the first frame only: one whose side data are looked at is part of a ring of objects,
-        # and stays in memory until Python looks for garbage.
+        """How a frame is turned for display: rows become columns, rows and columns reversed.
+
+        The display matrix maps a pixel's column and row to those of the display; the nearest of its
+        eight turns and mirror images is taken. It is that of the first frame: one whose side data
+        are looked at is part of a ring of objects, and stays in memory until Python looks for
+        garbage.
+        """
         if self._turn is None:
-            self._turn = _turn(frame)
+            self._turn = False, False, False
+            stated = next((s for s in frame.side_data if s.type.name == "DISPLAYMATRIX"), None)
+            if stated is not None:
+                a, b, _, c, d = (int(value) for value in np.frombuffer(stated, np.int32)[:5])
+                swapped = max(abs(b), abs(c)) > max(abs(a), abs(d))
+                self._turn = (True, b < 0, c < 0) if swapped else (False, d < 0, a < 0)
         return self._turn
 
     def upright_size(self, frame: Any) -> tuple[int, int]:
@@ -427,30 +426,6 @@ class _Video:
             image = image.transpose(1, 0, 2)
         image = image[:: -1 if up else 1, :: -1 if back else 1]
         return np.ascontiguousarray(image)
-
-
-def _turn(frame: Any) -> tuple[bool, bool, bool]:
-    """How a frame is turned for display: rows become columns, then rows and columns reversed.
-
-    The display matrix maps a pixel's column and row to those of the display; the nearest of its
-    eight turns and mirror images is taken.
-    """
-    stated = next((s for s in frame.side_data if s.type.name == "DISPLAYMATRIX"), None)
-    if stated is None:
-        return False, False, False
-    a, b, _, c, d = (int(value) for value in np.frombuffer(stated, dtype=np.int32)[:5])
-    if max(abs(b), abs(c)) > max(abs(a), abs(d)):
-        return True, b < 0, c < 0
-    return False, d < 0, a < 0
-
-
-def _rate(stream: Any) -> float:
-    """Frames per second; 30 where the file states none that can be."""
-    rates = [stream.average_rate, stream.guessed_rate, stream.codec_context.framerate]
-    if stream.time_base is not None and stream.time_base >= 1:
-        # Such a clock counts no frames.
-        rates = rates[2:]
-    return next((float(rate) for rate in rates if rate and 0 < rate <= 1000), 30.0)
 
 
 def _expected(container: Any, stream: Any, kind: str) -> tuple[int | None, float | None, bool]:
@@ -470,13 +445,6 @@ def _expected(container: Any, stream: Any, kind: str) -> tuple[int | None, float
     return None, None, True
 
 
-def _stated_frames(stream: Any, packets: int | None) -> int:
-    """Number of frames that a file lists; an edit list may leave some out."""
-    if packets is None:
-        return int(stream.frames)
-    return packets - sum(entry.is_discard for entry in stream.index_entries)
-
-
 def _choose(container: Any, path: Path) -> Any:
     """The stream that is the video: not a cover, not a preview, decodable, marked, the largest."""
     streams = list(container.streams.video)
@@ -489,7 +457,7 @@ def _choose(container: Any, path: Path) -> Any:
         moving = _with_frames(container, moving)
     if not moving:
         raise BadInput("contains no video but a cover picture", where=path)
-    readable = [stream for stream in moving if _can_decode(stream)]
+    readable = [one for one in moving if one.codec_context and one.codec_context.codec]
     if not readable:
         names = ", ".join(_codec_name(stream) for stream in moving)
         raise BadInput(
@@ -517,10 +485,6 @@ def _with_frames(container: Any, streams: list[Any]) -> list[Any]:
     container.seek(0)
     most = min(max(counts.values()), _MOVING)
     return [stream for stream in streams if counts[stream.index] >= most]
-
-
-def _can_decode(stream: Any) -> bool:
-    return stream.codec_context is not None and stream.codec_context.codec is not None
 
 
 def _codec_name(stream: Any) -> str:

@@ -20,6 +20,7 @@ from hwp_bench.hands.raster import draw_faces, draw_silhouette, overlap
 from hwp_bench.hands.template import boundary_vertices
 from hwp_bench.importers.shared.frames import CropWindows, cells, each_frame, resample
 from hwp_bench.importers.shared.landmarks import Landmarks
+from hwp_bench.importers.shared.output import ProjectedHand
 from hwp_bench.importers.video.decode import ClipImages
 from hwp_bench.importers.video.model import ClipModel, pose_vertices
 from hwp_bench.importers.video.residuals import FIELD_SIZE, signed_distance
@@ -59,15 +60,13 @@ class ColourModel:
         return ColourModel(background, foreground)
 
 
-def learn_colours(
-    samples: Iterable[tuple[np.ndarray, np.ndarray]], seed: int = 0
-) -> ColourModel | None:
+def learn_colours(samples: Iterable[tuple[np.ndarray, np.ndarray]]) -> ColourModel | None:
     """Learn the mixtures; None where hand or surroundings have fewer than 100 pixels.
 
     `samples` are, for each frame, colours (N, 3) uint8 of pixels that are hand, and of those that
     are not.
     """
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(0)
     kinds: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     for sample in samples:
         for pixels, found in zip(kinds, sample, strict=True):
@@ -76,7 +75,7 @@ def learn_colours(
     hand, other = (np.concatenate([np.zeros((0, 3), np.uint8), *pixels]) for pixels in kinds)
     if min(len(hand), len(other)) < 100:
         return None
-    cv2.setRNGSeed(seed)
+    cv2.setRNGSeed(0)
     model = _mixtures(hand, other, random)
     # The silhouette also covers objects in the hand. Colours that also occur next to the hand
     # are therefore not learnt as hand. (A hand before skin-coloured things is not harmed.)
@@ -209,9 +208,8 @@ def segment_clip(
 ) -> Iterator[tuple[Prompt, Segmentation]]:
     """Segment every frame with one colour model for the whole clip.
 
-    Args:
-        image: gives the (S, S, 3) uint8 RGB image of a frame; called from several threads.
-        hand_size: px of these images.
+    `image` gives the (S, S, 3) uint8 RGB image of a frame, from several threads; `hand_size` is in
+    px of these images.
     """
     chosen = np.unique(np.linspace(0, count - 1, min(count, _COLOUR_FRAMES)).astype(int))
 
@@ -328,13 +326,19 @@ class ProjectedClip:
     #: Where the crops lie.
     windows: CropWindows
 
-    def in_crop(self, pixels: np.ndarray, frame: int, edge: int) -> np.ndarray:
-        """Move pixels of a whole frame to its crop at `edge` px."""
-        return (pixels - self.windows.corners[frame]) * (edge / self.windows.side)
+    def drawn(self) -> ProjectedHand:
+        """The hand in the crops, as a sheet shows it."""
+        pixels, landmarks = map(self.windows.place, (self.pixels, self.landmarks))
+        shown = np.ones(len(self.pixels), dtype=bool)
+        return ProjectedHand(self.vertices, pixels, landmarks, self.faces, shown)
+
+    def in_crop(self, frame: int, edge: int) -> np.ndarray:
+        """(V, 2) px of the vertices in a frame's crop of `edge` px."""
+        return self.windows.place(self.pixels[frame], edge, frame)
 
     def silhouette(self, frame: int, edge: int) -> np.ndarray:
         """(edge, edge) uint8, 255 where the mesh is in a frame's crop."""
-        return draw_silhouette(self.in_crop(self.pixels[frame], frame, edge), self.faces, edge)
+        return draw_silhouette(self.in_crop(frame, edge), self.faces, edge)
 
 
 def project_clip(model: ClipModel, windows: CropWindows) -> ProjectedClip:
@@ -350,12 +354,7 @@ def project_clip(model: ClipModel, windows: CropWindows) -> ProjectedClip:
 
 
 class ProjectedHands:
-    """One hand or two, projected, as one prompt for the cut of their masks.
-
-    Args:
-        hands: one or two.
-        landmarks: of each.
-    """
+    """One hand or two, projected, as one prompt for the cut of their masks."""
 
     def __init__(self, hands: Sequence[ProjectedClip], landmarks: Sequence[Landmarks]) -> None:
         from scipy.ndimage import binary_dilation
@@ -372,7 +371,7 @@ class ProjectedHands:
         prompts = []
         for hand, shown in zip(self.hands, self.shown[:, frame], strict=True):
             if shown:
-                pixels = hand.in_crop(hand.pixels[frame], frame, edge)
+                pixels = hand.in_crop(frame, edge)
                 beyond = beyond_wrist(hand.vertices[frame], pixels, hand.ring, edge)
                 prompts.append(Prompt(hand.silhouette(frame, edge), beyond, detected))
         if not prompts:
@@ -422,10 +421,11 @@ class ProjectedHands:
         def weights(frame: int) -> np.ndarray:
             if not self.shown[:, frame].all():
                 return np.ones(own.landmarks.shape[1])
-            pixels = other.in_crop(other.pixels[frame], frame, edge)
+            pixels = other.in_crop(frame, edge)
             depth = other.vertices[frame, :, 2]
             face, _ = draw_faces(pixels, depth, other.faces, (edge, edge))
-            rows, columns, _ = cells(own.in_crop(own.landmarks[frame], frame, edge), face.shape)
+            places = own.windows.place(own.landmarks[frame], edge, frame)
+            rows, columns, _ = cells(places, face.shape)
             found = face[rows, columns]
             surface = depth[other.faces[found]].mean(axis=1)
             hidden = (found >= 0) & (own.depths[frame] > surface + _BEHIND)
@@ -439,7 +439,7 @@ class ProjectedHands:
         if not shown.all():
             return np.full((edge, edge), int(shown[1] and not shown[0]))
         first, second = self.hands
-        pixels = [hand.in_crop(hand.pixels[frame], frame, edge) for hand in self.hands]
+        pixels = [hand.in_crop(frame, edge) for hand in self.hands]
         depth = np.concatenate([hand.vertices[frame, :, 2] for hand in self.hands])
         faces = np.concatenate([first.faces, second.faces + len(pixels[0])])
         face, _ = draw_faces(np.concatenate(pixels), depth, faces, (edge, edge))
@@ -463,11 +463,6 @@ def beyond_wrist(
     The open end of the mesh spans a plane; its normal points along the forearm. Seen at the
     wrist's depth, the plane cuts the image in a line, and the forearm lies behind the line. There
     is none for a mesh without an open end, or seen straight along the forearm.
-
-    Args:
-        vertices: (V, 3) camera axes, m.
-        pixels: (V, 2) px.
-        size: edge of the image, px.
     """
     if len(ring) < 3:
         return np.zeros((size, size), dtype=bool)
@@ -502,17 +497,14 @@ def cut_masks(
     detected: np.ndarray,
     hand_size: float,
     settings: MaskSettings,
-    *,
     own: np.ndarray | None = None,
     reduction: int = 1,
     update: Callable[[int], None] | None = None,
 ) -> ClipMasks:
     """Cut the masks of a clip, prompted by a fit.
 
-    Args:
-        detected: (F,) bool, frames whose pose comes from a detection.
-        hand_size: px of the working images.
-        own: (F, S, S) uint8 masks of the user's own at the working resolution, taken as they are.
+    In `detected` frames (F,) the pose comes from a detection. `hand_size` is in px of the working
+    images, and so are `own`, (F, S, S) uint8, masks of the user's own.
     """
     working, size = images.working, images.frames.shape[1]
     edge = working.shape[1] // reduction

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,13 +77,9 @@ class SomeVertices:
 
 
 class ClipModel:
-    """Poses a clip from its variables.
+    """Poses a clip from its variables, which are relative to a start.
 
-    Args:
-        template: the hand.
-        start: rigid motion that the variables are relative to.
-        focal: px, the start of the focal length.
-        centre: (2,) principal point, px.
+    `focal`, px, is where the focal length starts; `centre` (2,) the principal point, px.
     """
 
     def __init__(
@@ -131,7 +128,7 @@ class ClipModel:
             rotation=rotation,
             place=place,
             transforms=rest.transforms,
-            landmarks=_moved(rest.landmarks + turned[..., 0], rotation, place),
+            landmarks=(rest.landmarks + turned[..., 0]) @ rotation.mT + place[:, None],
             pose=pose,
         )
 
@@ -156,7 +153,7 @@ class ClipModel:
         motion = posed.transforms[:, :, :3].flatten(start_dim=2)
         blended = (some.weights @ motion).unflatten(-1, (3, 4))
         skinned = (blended[..., :3] @ shaped[..., None])[..., 0] + blended[..., 3]
-        return _moved(skinned, posed.rotation, posed.place)
+        return skinned @ posed.rotation.mT + posed.place[:, None]
 
     def pixels(self, points: torch.Tensor) -> torch.Tensor:
         """Project (F, P, 3) m to (F, P, 2) px; points at the camera's plane stay finite."""
@@ -180,21 +177,21 @@ class ClipModel:
         )
 
 
-#: Frames posed at once, to bound memory with fine templates.
+# Frames posed at once, to bound memory with fine templates.
 _CHUNK = 64
 
 
-def pose_vertices(model: ClipModel, chunk: int = _CHUNK) -> np.ndarray:
+def pose_vertices(model: ClipModel) -> np.ndarray:
     """Return the vertices of every frame in the camera frame, (F, V, 3) float32 m."""
     parameters = model.parameters(np.ones(len(model.variables.turn), dtype=bool))
     betas = torch.as_tensor(parameters.betas, dtype=torch.float32)
-    pieces = []
+    pose = torch.as_tensor(parameters.pose, dtype=torch.float32).split(_CHUNK)
+    transl = torch.as_tensor(parameters.transl, dtype=torch.float32).split(_CHUNK)
     with torch.no_grad():
-        for first in range(0, parameters.frame_count, chunk):
-            rows = slice(first, first + chunk)
-            pose = torch.as_tensor(parameters.pose[rows], dtype=torch.float32)
-            transl = torch.as_tensor(parameters.transl[rows], dtype=torch.float32)
-            pieces.append(pose_hand(model.tensors, pose, betas, transl).vertices)
+        pieces = [
+            pose_hand(model.tensors, *part).vertices
+            for part in zip(pose, itertools.repeat(betas), transl, strict=False)
+        ]
     return torch.cat(pieces).numpy()
 
 
@@ -212,10 +209,6 @@ def unwrap_rotations(rotations: np.ndarray) -> np.ndarray:
         if np.linalg.norm(other - before) < np.linalg.norm(vectors[frame] - before):
             vectors[frame] = other
     return vectors
-
-
-def _moved(points: torch.Tensor, rotation: torch.Tensor, place: torch.Tensor) -> torch.Tensor:
-    return points @ rotation.mT + place[:, None]
 
 
 # --- The start: one rigid pose for each frame, in closed form
@@ -242,26 +235,23 @@ def rigid_start(
     so its world landmarks are first turned by the angle between the optical axis and the ray
     through the hand. The rotation is the orthogonal Procrustes solution on the palm, the place
     the least-squares solution of the pinhole equations, which are linear in it. Frames without
-    a detection are interpolated.
-
-    Args:
-        rest: (21, 3) m, the template's landmarks at rest.
-        focal: px.
-        centre: (2,) principal point, px.
+    a detection are interpolated. `rest` (21, 3) m are the template's landmarks.
     """
-    from scipy.spatial.transform import Rotation
+    from scipy.spatial.transform import Rotation, Slerp
 
-    seen = np.flatnonzero(landmarks.detected)
+    count, seen = landmarks.score.size, np.flatnonzero(landmarks.detected)
     pixels = landmarks.image[seen]
     turn = _ray_rotation(pixels.mean(axis=1), focal, centre)
     world = np.einsum("fij,fkj->fki", turn, landmarks.world[seen])
     palm = list(PALM)
     rotation = _procrustes(rest[palm], world[:, palm])
     wrist = _place(world - world[:, :1], (pixels - centre) / focal)
+    known, frames = Rotation.from_matrix(rotation), np.clip(np.arange(count), seen[0], seen[-1])
+    turns = Slerp(seen, known)(frames) if len(seen) > 1 else known[np.zeros(count, int)]
     return RigidStart(
-        rotation=_interpolate_rotations(Rotation.from_matrix(rotation), seen, landmarks.score.size),
-        wrist=interpolate(wrist, seen, landmarks.score.size),
-        world=interpolate(world, seen, landmarks.score.size),
+        rotation=turns.as_matrix(),
+        wrist=interpolate(wrist, seen, count),
+        world=interpolate(world, seen, count),
     )
 
 
@@ -270,15 +260,6 @@ def interpolate(values: np.ndarray, seen: np.ndarray, count: int) -> np.ndarray:
     flat = values.reshape(len(seen), -1)
     columns = [np.interp(np.arange(count), seen, column) for column in flat.T]
     return np.stack(columns, axis=1).reshape(count, *values.shape[1:])
-
-
-def _interpolate_rotations(rotations: object, seen: np.ndarray, count: int) -> np.ndarray:
-    from scipy.spatial.transform import Slerp
-
-    if len(seen) == 1:
-        return np.repeat(rotations.as_matrix(), count, axis=0)  # type: ignore[attr-defined]
-    frames = np.clip(np.arange(count), seen[0], seen[-1])
-    return Slerp(seen, rotations)(frames).as_matrix()
 
 
 def _ray_rotation(pixels: np.ndarray, focal: float, centre: np.ndarray) -> np.ndarray:
@@ -337,10 +318,7 @@ class SurfaceMotion:
     """Derivatives of the vertices' pixels by the variables of their frame, in closed form.
 
     Automatic differentiation would need one pass for each of thousands of pixels. Correctives
-    count as they are and not in how they change, as in `ClipModel.choose`.
-
-    Args:
-        model: the clip; read once, as it is now.
+    count as they are and not in how they change, as in `ClipModel.choose`. The model is read once.
     """
 
     def __init__(self, model: ClipModel) -> None:
@@ -366,14 +344,7 @@ class SurfaceMotion:
         self._below = moved_joints()
 
     def by_variables(self, frame: int, vertices: np.ndarray) -> np.ndarray:
-        """Differentiate vertices' pixels of the whole frame.
-
-        Args:
-            vertices: (P,) which vertices.
-
-        Returns:
-            (P, 2, 51) px per unit of each of the `frame_variables`.
-        """
+        """Differentiate pixels of P vertices: (P, 2, 51) px per unit of the `frame_variables`."""
         rotation, wrist = self._rotation[frame], self._joints[0]
         motion = self._transforms[frame, :, :3]
         weights = self._weights[vertices]
@@ -385,7 +356,8 @@ class SurfaceMotion:
         arms = below - (weights @ self._below.T)[:, :, None] * centres
         own = below[:, 0]
         moved = np.zeros((len(vertices), 3, FRAME_VARIABLES))
-        moved[:, :, :3] = -rotation @ _cross(own - wrist) @ self._turn_rates[frame]
+        arm = cross_matrix(torch.from_numpy(own - wrist)).numpy()
+        moved[:, :, :3] = -rotation @ arm @ self._turn_rates[frame]
         # The cross product of each of a joint's three axes with the arm from the joint.
         x, y, z = np.moveaxis(rotation @ motion[1:, :, :3] @ self._finger_rates[frame], 1, 0)
         u, v, w = np.einsum("ab,njb->anj", rotation, arms[:, 1:])[..., None]
@@ -408,7 +380,3 @@ class SurfaceMotion:
             turns = Rotation.from_rotvec(self._fingers[frame]).as_matrix() - np.eye(3)
             rest = rest + self._correctives[vertices] @ turns.ravel()
         return np.asarray(rest)
-
-
-def _cross(vectors: np.ndarray) -> np.ndarray:
-    return np.asarray(cross_matrix(torch.from_numpy(vectors)).numpy())

@@ -21,7 +21,7 @@ from hwp_bench.hands.template import boundary_vertices
 from hwp_bench.importers.shared.frames import CropWindows, cells, each_frame
 from hwp_bench.importers.shared.landmarks import Landmarks
 from hwp_bench.importers.video.model import ClipModel, PosedClip, pose_vertices
-from hwp_bench.importers.video.texture import sample
+from hwp_bench.importers.video.pictures import sample
 
 # --- Landmarks, motion, and what is known of hands
 
@@ -53,12 +53,8 @@ _SIZE_SCALE, _FOCAL_SCALE = 0.05, 0.15
 class LandmarkResidual:
     """Everything that does not need the images: landmarks, smoothness, anatomy, priors.
 
-    Args:
-        landmarks: of the clip; frames without a detection count only in the other terms.
-        model: the clip.
-        fps: frames per second; None where the frames are far apart, so that motion between them
-            is not smooth.
-        default_focal: px, the focal length that the prior favours; None = it is known.
+    `fps` is None where the frames are far apart, so that motion between them is not smooth.
+    `default_focal`, px, is what the prior favours; None where the focal length is known.
     """
 
     def __init__(
@@ -88,8 +84,7 @@ class LandmarkResidual:
     def from_afar(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
         """Return the energy for the first steps, when most fingers are bent wrongly.
 
-        The world landmarks dominate, because only they show in which direction a finger bends. The
-        image landmarks only place the hand.
+        Only the world landmarks, which dominate, show in which direction a finger bends.
         """
         image = (self.weight * charbonnier(self._image_error(model, posed))).sum()
         return _START_IMAGE_WEIGHT * image + self._world(model, posed) + self._rest(model, posed)
@@ -110,23 +105,11 @@ class LandmarkResidual:
         return (self.weight * charbonnier(squared)).sum()
 
     def _rest(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
-        return self._motion(model, posed) + self._priors(model, posed)
-
-    def _motion(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
-        energy = posed.landmarks.new_zeros(())
-        if self.pace is None:
-            return energy
-        for track, scale in (
-            (posed.landmarks, _MOTION_SCALE),
-            (model.variables.fingers, _TURNING_SCALE),
-        ):
-            if len(track) > 2:
+        free, motion = model.variables, posed.landmarks.new_zeros(())
+        for track, scale in ((posed.landmarks, _MOTION_SCALE), (free.fingers, _TURNING_SCALE)):
+            if self.pace is not None and len(track) > 2:
                 bend = (track[2:] - 2.0 * track[1:-1] + track[:-2]) / (scale * self.pace)
-                energy = energy + charbonnier((bend**2).sum(dim=-1)).sum()
-        return _MOTION_WEIGHT * energy
-
-    def _priors(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
-        free = model.variables
+                motion = motion + charbonnier((bend**2).sum(dim=-1)).sum()
         anatomy = _LIMIT_WEIGHT * joint_limit_penalty(posed.pose, self.limits).sum()
         anatomy = anatomy + self.contact(model, posed)
         anatomy = anatomy + _POSE_WEIGHT * (free.fingers**2).sum()
@@ -135,17 +118,14 @@ class LandmarkResidual:
         if self.default_focal is not None:
             focal = (free.log_focal - float(np.log(self.default_focal))) / _FOCAL_SCALE
             constant = constant + focal**2
-        return anatomy + 0.5 * self.prior * constant
+        return _MOTION_WEIGHT * motion + (anatomy + 0.5 * self.prior * constant)
 
 
 def geman_mcclure(squared: torch.Tensor, turn: float = 2.0) -> torch.Tensor:
-    """r^2 / (1 + r^2 / (4 turn^2)): quadratic for small r, constant for outliers.
+    """r^2 / (1 + r^2 / (4 turn^2)) of r^2: quadratic for small r, constant for outliers.
 
-    Args:
-        squared: residual over scale, squared.
-        turn: residual, in scales, beyond which the pull fades.
-
-    Source: Geman and McClure, 1987, scaled to the second derivative of r^2.
+    The pull fades beyond a residual of `turn` scales. Source: Geman and McClure, 1987, scaled to
+    the second derivative of r^2.
     """
     return squared / (1.0 + squared / (4.0 * turn * turn))
 
@@ -313,13 +293,10 @@ class OutlineResidual:
     the hand and never chosen.
 
     Args:
-        fields: (F, S, S) signed distances of the masks of hand and forearm, from
-            `signed_distance`; zero fields have no effect.
+        fields: (F, S, S) from `signed_distance`, of hand and forearm; zero fields do nothing.
         usable: (F,) bool, frames that count.
-        windows: where the fields lie in the whole frame.
-        hand_size: size of the hand in the whole frame, px.
-        ignored: (F, FIELD_SIZE, FIELD_SIZE) bool, where the mask's outline is not this hand's: skin
-            meets skin there; None where nothing is.
+        hand_size: px of the whole frame.
+        ignored: (F, S, S) bool, where skin meets skin, or None.
     """
 
     def __init__(
@@ -356,9 +333,11 @@ class OutlineResidual:
             return match_outline(pixels[frame], faces, usable, self.fields[frame], self.reach)
 
         matches = list(each_frame(match, range(len(self.usable))))
-        self.normal = torch.as_tensor(np.stack([match.normal for match in matches]))
-        self.target = torch.as_tensor(np.stack([match.target for match in matches]))
-        self.outline = model.choose(torch.as_tensor(np.stack([match.index for match in matches])))
+        index, self.normal, self.target = (
+            torch.as_tensor(np.stack([getattr(match, name) for match in matches]))
+            for name in ("index", "normal", "target")
+        )
+        self.outline = model.choose(index)
 
     def __call__(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
         """Return the energy, a scalar."""
@@ -413,18 +392,11 @@ def signed_distance(mask: np.ndarray) -> np.ndarray:
 def match_outline(
     pixels: np.ndarray, faces: np.ndarray, candidates: np.ndarray, field: np.ndarray, reach: float
 ) -> Outline:
-    """Match the outline of a mesh with the outline of a mask.
+    """Match the outline of a mesh, (V, 2) px of the field, with the outline of a mask.
 
-    Each vertex looks along its normal for the nearest place where the mask ends in the same
-    direction: a finger's left side never snaps to the right side of its neighbour, as it may
-    with the plainly nearest point.
-
-    Args:
-        pixels: (V, 2) vertices, px of the field.
-        faces: (F, 3) int.
-        candidates: (C,) vertices that may be chosen.
-        field: (FIELD_SIZE, FIELD_SIZE) signed distance of the mask.
-        reach: how far to look, px of the field.
+    Each of the `candidates` looks along its normal, as far as `reach` px, for the nearest place
+    where the mask ends in the same direction: a finger's left side never snaps to the right side
+    of its neighbour, as it may with the plainly nearest point.
     """
 
     def read(image: np.ndarray, at: np.ndarray) -> np.ndarray:
@@ -433,7 +405,11 @@ def match_outline(
     own = signed_distance(draw_silhouette(pixels, faces, FIELD_SIZE)).astype(np.float32)
     if not own.any():
         return Outline.nothing()
-    chosen = _on_outline(pixels, own, candidates)
+    # Those near the outline, evenly thinned.
+    rows, columns, inside = cells(pixels[candidates], own.shape)
+    chosen = candidates[inside & (own[rows, columns] >= -_OUTLINE_WITHIN)]
+    if len(chosen) > _OUTLINE_COUNT:
+        chosen = chosen[np.linspace(0, len(chosen) - 1, _OUTLINE_COUNT).astype(np.int64)]
     places = pixels[chosen].astype(np.float32)
     smooth = cv2.GaussianBlur(own, (0, 0), 1.0)
     gradient = np.stack(
@@ -459,12 +435,3 @@ def match_outline(
     outline.normal[:count] = np.where(matched[:, None], normals, 0.0)
     outline.target[:count] = np.where(matched, (normals * places).sum(axis=1) + offset, 0.0)
     return outline
-
-
-def _on_outline(pixels: np.ndarray, own: np.ndarray, candidates: np.ndarray) -> np.ndarray:
-    """Candidates near the outline, at most _OUTLINE_COUNT, evenly thinned."""
-    rows, columns, inside = cells(pixels[candidates], own.shape)
-    chosen = candidates[inside & (own[rows, columns] >= -_OUTLINE_WITHIN)]
-    if len(chosen) > _OUTLINE_COUNT:
-        chosen = chosen[np.linspace(0, len(chosen) - 1, _OUTLINE_COUNT).astype(np.int64)]
-    return chosen

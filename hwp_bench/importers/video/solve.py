@@ -14,7 +14,8 @@ from hwp_bench.base.arrays import evenly
 from hwp_bench.base.console import notice
 from hwp_bench.base.errors import DidNotConverge
 from hwp_bench.hands import HandTemplate, load_template, pose_hand
-from hwp_bench.importers.shared.landmarks import LANDMARK_NAMES, SIDES, Landmarks
+from hwp_bench.hands.skeleton import SIDES
+from hwp_bench.importers.shared.landmarks import LANDMARK_NAMES, Landmarks
 from hwp_bench.importers.video.model import ClipModel, PosedClip, rigid_start
 from hwp_bench.importers.video.pictures import PictureResidual, SurfaceResidual
 from hwp_bench.importers.video.residuals import LandmarkResidual, OutlineResidual
@@ -47,8 +48,11 @@ _REFINING = 0.3
 # The rate rises over the first steps and ends at this share.
 _WARM_UP, _LAST_RATE = 20, 0.02
 
-#: Called with the number of steps that are done.
-Update = Callable[[int], None]
+#: Called after each step.
+Tick = Callable[[], None]
+
+
+def _no_tick() -> None: ...
 
 
 @dataclass(frozen=True)
@@ -136,20 +140,15 @@ def fit_landmarks(
     template: HandTemplate,
     footage: Footage,
     settings: FitSettings,
-    update: Update | None = None,
+    tick: Tick = _no_tick,
 ) -> FittedClip:
     """Fit pose, shape, place and (unless given) focal length to the landmarks of a clip."""
     model = start_model(landmarks, template, footage)
     prior = footage.first_focal if footage.focal is None else None
     residual = LandmarkResidual(landmarks, model, footage.fps, prior)
     hold = () if footage.focal is None else ("log_focal",)
-    descend(model, residual.from_afar, settings.start_steps, hold=_CONSTANTS, update=update)
-
-    def later(step: int) -> None:
-        if update is not None:
-            update(settings.start_steps + step)
-
-    descend(model, residual, settings.landmark_steps, hold=hold, update=later)
+    descend(model, residual.from_afar, settings.start_steps, hold=_CONSTANTS, tick=tick)
+    descend(model, residual, settings.landmark_steps, hold=hold, tick=tick)
     return FittedClip(model, residual, settings)
 
 
@@ -170,25 +169,23 @@ def share_camera(hands: Sequence[FittedClip], *, steps: int) -> None:
 
 
 def fit_outline(
-    fitted: FittedClip,
-    *residuals: OutlineResidual | SurfaceResidual,
-    update: Update | None = None,
+    fitted: FittedClip, *residuals: OutlineResidual | SurfaceResidual, tick: Tick = _no_tick
 ) -> None:
     """Refine a fit, in place, so that the mesh's outline meets the masks' outline.
 
     With a texture, what lies inside the outline meets the mean of all frames, too.
     """
     rounds, steps = fitted.settings.contour_rounds, fitted.settings.contour_steps
-    _refine(fitted, residuals, rounds, steps, _HELD_BY_LANDMARKS, update)
+    _refine(fitted, residuals, rounds, steps, _HELD_BY_LANDMARKS, tick)
 
 
-def fit_picture(fitted: FittedClip, picture: PictureResidual, update: Update | None = None) -> None:
+def fit_picture(fitted: FittedClip, picture: PictureResidual, tick: Tick = _no_tick) -> None:
     """Refine the poses of a fit, in place, so that the lit hand, as it is drawn, meets the frames.
 
     Shape, size and distance of the hand stay.
     """
     rounds = fitted.settings.picture_rounds
-    _refine(fitted, [picture], rounds, PICTURE_STEPS, _HELD_BY_OUTLINE, update)
+    _refine(fitted, [picture], rounds, PICTURE_STEPS, _HELD_BY_OUTLINE, tick)
 
 
 def _refine(
@@ -197,7 +194,7 @@ def _refine(
     rounds: int,
     steps: int,
     hold: tuple[str, ...],
-    update: Update | None,
+    tick: Tick,
 ) -> None:
     """Refine a fit, in place, by residuals that are matched to the images again in each round."""
 
@@ -207,12 +204,10 @@ def _refine(
             value = value + residual(model, posed)
         return value
 
-    for done in range(rounds):
+    for _ in range(rounds):
         for residual in residuals:
             residual.rematch(fitted.model)
-        descend(fitted.model, energy, steps, rate=_REFINING, hold=hold)
-        if update is not None:
-            update((done + 1) * steps)
+        descend(fitted.model, energy, steps, rate=_REFINING, hold=hold, tick=tick)
 
 
 def reprojection_error(fitted: FittedClip, landmarks: Landmarks) -> ReprojectionError:
@@ -246,7 +241,7 @@ def descend(
     *,
     rate: float = 1.0,
     hold: tuple[str, ...] = (),
-    update: Update | None = None,
+    tick: Tick = _no_tick,
 ) -> None:
     """Lower an energy over the model's variables but those of `hold`, in place, by Adam.
 
@@ -276,8 +271,7 @@ def descend(
             loss.backward()
             optimizer.step()
             scheduler.step()
-            if update is not None:
-                update(step + 1)
+            tick()
 
 
 @contextmanager

@@ -9,8 +9,9 @@ separate the colours on them from those around them better than any that lie els
 
 from __future__ import annotations
 
+import itertools
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -22,9 +23,9 @@ from hwp_bench.base.console import notice, progress
 from hwp_bench.base.errors import BadInput, UsageError, has_odd_characters
 from hwp_bench.base.records import MAX_TEXT
 from hwp_bench.capture.schema import MAX_FRAMES
+from hwp_bench.hands.skeleton import LANDMARK_EDGES, SIDES
 from hwp_bench.importers.shared.frames import CropWindows, cells, follow_hands
 from hwp_bench.importers.shared.landmarks import (
-    LANDMARK_EDGES,
     Association,
     Landmarks,
     check_against_video,
@@ -32,6 +33,7 @@ from hwp_bench.importers.shared.landmarks import (
     read_hand_tracks,
     read_landmarks,
 )
+from hwp_bench.importers.shared.output import CHOICES, check_choices
 from hwp_bench.importers.video.decode import (
     ClipImages,
     FrameRange,
@@ -51,12 +53,7 @@ from hwp_bench.importers.video.solve import (
     side_scores,
     warn_of_contradiction,
 )
-
-#: Sides of two hands, in the order in which a capture has them.
-BOTH = ("right", "left")
-
-#: The hands that can be asked for, as the person sees them; `auto` is what the landmarks show.
-CHOICES = ("auto", "right", "left", "both")
+from hwp_bench.taxonomy import perturbation
 
 
 @dataclass(frozen=True)
@@ -99,24 +96,23 @@ class VideoImport:
     fit: FitSettings = field(default_factory=FitSettings)
 
     def __post_init__(self) -> None:
-        rules = (
+        # Texts have the bounds that they have in `capture.json`, which is written after all work.
+        texts = {name: getattr(self, name) for name in ("action", "device", "licence")}
+        texts["hand-model"] = self.hand_model
+        long = f"must have 1 to {MAX_TEXT:,} characters"
+        check_choices(
             ("--side", self.side in CHOICES, f"must be one of {', '.join(CHOICES)}"),
             ("--focal", self.focal is None or 1 <= self.focal <= 1e6, "must be 1 to 1e6 px"),
             ("--size", 32 <= self.size <= 2048, "must be 32 to 2048 px"),
             ("--min-score", 0 <= self.min_score <= 1, "must be in [0, 1]"),
-            *self._text_rules(),
+            *((f"--{name}", 1 <= len(text) <= MAX_TEXT, long) for name, text in texts.items()),
+            *(
+                (f"--{name}", not has_odd_characters(text), "holds a control character")
+                for name, text in texts.items()
+            ),
         )
-        for option, good, problem in rules:
-            if not good:
-                raise UsageError(problem, field=option)
-
-    def _text_rules(self) -> Iterator[tuple[str, bool, str]]:
-        """The same bounds as in `capture.json`, which is written after all the work."""
-        texts = {name: getattr(self, name) for name in ("action", "device", "licence")}
-        for name, text in {**texts, "hand-model": self.hand_model}.items():
-            long = f"must have 1 to {MAX_TEXT:,} characters"
-            yield f"--{name}", 1 <= len(text) <= MAX_TEXT, long
-            yield f"--{name}", not has_odd_characters(text), "holds a control character"
+        for name in self.perturbations:
+            perturbation(name)
 
     def capture_id(self, out: str | os.PathLike[str]) -> str:
         """Return the id of the capture that is written to `out`."""
@@ -192,7 +188,7 @@ def read_source(
         scores = side_scores(hand, options.hand_model, footage)
         if given is not None:
             votes = None if tracked is None else tracked.votes(given)
-            warn_of_contradiction(given, scores, votes, stated=options.side in BOTH)
+            warn_of_contradiction(given, scores, votes, stated=options.side in SIDES)
         hands[given or scores.better] = hand
     windows = follow_hands(list(hands.values()), footage.fps, options.size)
     _check_memory(windows)
@@ -203,8 +199,9 @@ def read_source(
     reading = endings[0] if endings else None
     if reading is not None:
         warn_of_damage(info, reading)
-    two = tracked is not None and len(hands) == 2
-    repaired = (tracked.swaps, tracked.doubles) if tracked is not None and two else (0, 0)
+    repaired = (0, 0)
+    if tracked is not None and len(hands) == 2:
+        repaired = (tracked.swaps, tracked.doubles)
     return VideoSource(
         info, Path(landmarks), indices, hands, windows, images, own, *repaired, reading
     )
@@ -215,7 +212,7 @@ def _read_hands(
 ) -> dict[str | None, Landmarks]:
     """Landmarks by side; the key is None where the file says nothing of it and nobody else."""
     sides: tuple[str | None, ...]
-    if options.side in BOTH:
+    if options.side in SIDES:
         sides = (options.side,)
     else:
         sides = (None,) if tracked is None else tracked.sides
@@ -367,13 +364,13 @@ def doubts_of_axes(landmarks: Landmarks, which: str = "`image` or `world`") -> l
         return float((image * (world @ np.array(axes, float).T)).sum(axis=(1, 2)).mean())
 
     as_given = alike(((1, 0), (0, 1)))
+    if as_given >= _UNLIKE:
+        return []
     scores = {name: alike(axes) for name, axes in _AXES.items()}
     best = max(scores, key=lambda name: scores[name])
-    if as_given < _UNLIKE and scores[best] > max(_ALIKE, as_given):
+    if scores[best] > max(_ALIKE, as_given):
         return [best.format(which)]
-    if as_given < _UNLIKE:
-        return ["`image` and `world` do not show the same hand in the same frames"]
-    return []
+    return ["`image` and `world` do not show the same hand in the same frames"]
 
 
 def _doubts_of_pictures(source: VideoSource, landmarks: Landmarks) -> tuple[list[str], bool]:
@@ -396,11 +393,17 @@ def _doubts_of_pictures(source: VideoSource, landmarks: Landmarks) -> tuple[list
     best = max(moved, key=lambda name: moved[name])
     if _clearly(moved[best], as_given, _BETTER):
         return [best], False
-    late = {
-        shift * sign: _separation_of_frames(pictures, landmarks, rows, shift * sign)
-        for shift in _SHIFTS
-        for sign in (1, -1)
-    }
+    late: dict[int, float] = {}
+    for shift in (sign * step for step in _SHIFTS for sign in (1, -1)):
+        # By the landmarks of later (or earlier) frames, where enough of them show the hand.
+        other = np.array(rows) + shift
+        good = (other >= 0) & (other < len(landmarks.detected))
+        good[good] &= landmarks.detected[other[good]]
+        if good.sum() >= max(len(rows) // 2, 3):
+            used = list(itertools.compress(pictures, good))
+            late[shift] = _separation(used, landmarks.image[other[good]])
+    if not late:
+        return [], as_given > _SEPARATED
     shift = max(late, key=lambda one: late[one])
     if _clearly(late[shift], as_given, _BETTER_SHIFT):
         frames = abs(shift) * int(np.diff(source.indices).min())
@@ -431,19 +434,6 @@ def _pictures(source: VideoSource, landmarks: Landmarks) -> tuple[list[int], lis
     return rows, pictures
 
 
-def _separation_of_frames(
-    pictures: Sequence[np.ndarray], landmarks: Landmarks, rows: Sequence[int], shift: int
-) -> float:
-    """Separation by the landmarks of later (or earlier) frames; 0 where too few are seen."""
-    other = np.array(rows) + shift
-    good = (other >= 0) & (other < len(landmarks.detected))
-    good[good] &= landmarks.detected[other[good]]
-    if good.sum() < max(len(rows) // 2, 3):
-        return 0.0
-    used = [picture for picture, one in zip(pictures, good, strict=True) if one]
-    return _separation(used, landmarks.image[other[good]])
-
-
 def _separation(pictures: Sequence[np.ndarray], points: np.ndarray) -> float:
     """How well a line through colours tells those on (F, 21, 2) px from those around them.
 
@@ -455,11 +445,8 @@ def _separation(pictures: Sequence[np.ndarray], points: np.ndarray) -> float:
         along = np.linspace(0.0, 1.0, _ALONG)[:, None, None]
         on = (hand[_BONES[:, 0]] * (1.0 - along) + hand[_BONES[:, 1]] * along).reshape(-1, 2)
         size = np.ptp(hand, axis=0).max()
-        sides = [
-            np.linspace(hand[:, axis].min() - 0.45 * size, hand[:, axis].max() + 0.45 * size, n)
-            for axis, n in ((0, _AROUND), (1, _AROUND))
-        ]
-        grid = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
+        low, high = hand.min(axis=0) - 0.45 * size, hand.max(axis=0) + 0.45 * size
+        grid = np.stack(np.meshgrid(*np.linspace(low, high, _AROUND).T), axis=-1).reshape(-1, 2)
         apart = np.linalg.norm(grid[:, None] - on[None], axis=-1).min(axis=1)
         hand_colors, share = _colors(picture, on)
         others, _ = _colors(picture, grid[apart > 0.18 * size])

@@ -302,8 +302,8 @@ def test_steps_are_bounded(file: Path) -> None:
         load_pickle(file, max_steps=500)
 
 
-NEST = 200_000
-# The size of each is some 100 kB to 2 MB; what they make is nested 200,000 deep, or 2^60 large.
+NEST = 100_000
+# The size of each is some 50 kB to 1 MB; what they make is nested 100,000 deep, or 2^60 large.
 KILLING = {
     "tuples of one": b"})" + b"\x85" * NEST + b"K\x01s",
     "tuples of two": b"})" + b"K\x01\x86" * NEST + b"K\x01s",

@@ -57,8 +57,9 @@ def test_one_frame_has_poses_and_a_camera(make_capture: CaptureMaker, hands: str
     np.testing.assert_array_equal(camera.viewmat, capture.cameras.viewmats[7])
     assert (camera.width, camera.height) == (32, 32)
     for read in (capture.hand_poses, capture.camera, capture.frame):
-        with pytest.raises(UsageError, match="there is no frame 12, only 0 to 11"):
-            read(12)
+        for frame in (-1, 12):
+            with pytest.raises(UsageError, match=f"there is no frame {frame}, only 0 to 11"):
+                read(frame)
 
 
 def test_a_capture_describes_itself_in_a_line(make_capture: CaptureMaker) -> None:
@@ -219,13 +220,6 @@ def test_damaged_numbers_are_named(make_capture: CaptureMaker, tmp_path: Path) -
         Cameras(cameras(12, 32).Ks, viewmats)
 
 
-def test_an_array_file_with_pickled_objects_is_refused(make_capture: CaptureMaker) -> None:
-    root = make_capture(frames=12).root
-    np.savez(root / "hands.npz", right_pose=np.array([{"a": 1}], dtype=object))
-    with pytest.raises(BadInput, match="not a readable array file"):
-        open_capture(root)
-
-
 def test_the_check_names_damaged_images_and_strangers(make_capture: CaptureMaker) -> None:
     root = make_capture(frames=12).root
     (root / "frames" / "000004.png").write_bytes(b"")
@@ -256,13 +250,6 @@ def test_a_hand_behind_the_camera_and_an_empty_mask_are_found(
     assert "covers 0.00 %" in findings[1].problem
 
 
-def test_frames_out_of_range_are_refused(make_capture: CaptureMaker) -> None:
-    capture = make_capture(frames=10)
-    for frame in (-1, 10):
-        with pytest.raises(UsageError, match="there is no frame"):
-            capture.frame(frame)
-
-
 def test_a_damaged_hand_template_is_reported(
     make_capture: CaptureMaker, free_right: HandTemplate, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -289,7 +276,7 @@ def test_a_damaged_hand_template_is_reported(
     ]
 
 
-SIZE, FRAMES = 64, (50, 250)
+SIZE, FRAMES = 64, (20, 80)
 PIXELS = SIZE * SIZE * 4
 
 
@@ -378,13 +365,3 @@ def test_a_damaged_file_is_refused(path: Path, field: str, spoilt, reason: str) 
     write_npz(path, arrays | {f"right_{field}": spoilt(arrays[f"right_{field}"])})
     with pytest.raises(BadInput, match=reason):
         read_subject_mesh(path, load_template("anny", "right"))
-
-
-def test_objects_and_missing_files_are_refused(path: Path) -> None:
-    model = load_template("anny", "right")
-    np.savez(path, right_vertices=np.array([{"a": 1}], dtype=object))
-    with pytest.raises(BadInput, match="not a readable array file"):
-        read_subject_mesh(path, model)
-    path.unlink()
-    with pytest.raises(BadInput, match="does not exist"):
-        read_subject_mesh(path, model)

@@ -152,12 +152,8 @@ def test_meshes_are_the_posed_templates(hands: str, make_painted: Callable[..., 
     assert tuple(meshes) == capture.info.sides
     for side, mesh in meshes.items():
         template, hand = capture.template(side), capture.hands[side]
-        posed = pose_hand(
-            template.to_torch(torch.float64),
-            torch.from_numpy(hand.pose[3:4].astype(np.float64)),
-            torch.from_numpy(hand.betas.astype(np.float64)),
-            torch.from_numpy(hand.transl[3:4].astype(np.float64)),
-        )
+        given = (hand.pose[3:4], hand.betas, hand.transl[3:4])
+        posed = pose_hand(template.to_torch(torch.float64), *map(torch.from_numpy, given))
         np.testing.assert_allclose(mesh.vertices, posed.vertices[0].numpy(), atol=1e-12)
         np.testing.assert_array_equal(mesh.faces, template.faces)
 
@@ -192,13 +188,8 @@ def test_the_command_writes_a_mesh_and_names_what_is_wrong(
     assert [path.name for path in tmp_path.iterdir()] == ["hand.glb"]
 
 
-def test_truth_must_be_known(make_painted: Callable[..., Capture]) -> None:
-    capture = make_painted("right")
-    if capture.true_hands is None:
-        with pytest.raises(UsageError, match="does not know the true"):
-            hand_meshes(capture, 0, truth=True)
-    else:
-        hand = capture.true_hands["right"]
-        mesh = hand_meshes(capture, 0, truth=True)["right"]
-        assert np.isfinite(mesh.vertices).all()
-        assert hand.valid[0]
+def test_truth_must_be_known(make_capture: CaptureMaker) -> None:
+    with pytest.raises(UsageError, match="does not know the true"):
+        hand_meshes(make_capture("a", frames=10), 0, truth=True)
+    known = make_capture("b", frames=10, truth=True)
+    assert np.isfinite(hand_meshes(known, 0, truth=True)["right"].vertices).all()

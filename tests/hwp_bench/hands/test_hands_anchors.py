@@ -99,23 +99,6 @@ def test_anchors_are_spread_better_than_chance(free_right: HandTemplate) -> None
     assert mean_gap(points) > 1.15 * mean_gap(chance)
 
 
-def test_seeds_repeat_and_differ(free_right: HandTemplate) -> None:
-    first, again, other = (sample_surface(free_right, 1000, seed) for seed in (3, 3, 4))
-    np.testing.assert_array_equal(first.barycentric, again.barycentric)
-    np.testing.assert_array_equal(first.face_index, again.face_index)
-    assert not np.array_equal(first.barycentric, other.barycentric)
-
-
-def test_anchors_on_vertices_are_the_vertices(free_right: HandTemplate) -> None:
-    _, first = np.unique(free_right.faces, return_index=True)
-    anchors = SurfaceAnchors(first // 3, np.eye(3)[first % 3])
-    vertices, faces = tensors_of(free_right)
-    torch.testing.assert_close(anchor_positions(vertices, faces, anchors), vertices)
-    torch.testing.assert_close(
-        anchor_normals(vertices, faces, anchors), vertex_normals(vertices, faces)
-    )
-
-
 def test_tensors_and_arrays_are_the_same_anchors(free_right: HandTemplate) -> None:
     anchors = sample_surface(free_right, 50)
     moved = anchors.to_torch(torch.float64)
@@ -206,17 +189,6 @@ def test_normals_of_a_sphere_point_outwards() -> None:
     normals = vertex_normals(torch.tensor(sphere.vertices), torch.tensor(sphere.faces))
     cosine = (normals.numpy() * sphere.vertices).sum(axis=1)
     assert cosine.min() > 0.9999
-
-
-def test_normals_of_hands_point_outwards(free_right: HandTemplate, free_left: HandTemplate) -> None:
-    for hand in (free_right, free_left):
-        assert to_trimesh(hand.vertices, hand.faces).volume > 0.0
-
-
-def test_gradients_of_normals_agree_with_finite_differences(tiny_template: HandTemplate) -> None:
-    vertices = torch.from_numpy(tiny_template.vertices).requires_grad_()
-    faces = torch.from_numpy(tiny_template.faces)
-    assert torch.autograd.gradcheck(lambda v: vertex_normals(v, faces), (vertices,))
 
 
 def test_degenerate_faces_give_finite_normals_and_no_gradient() -> None:

@@ -269,10 +269,6 @@ def test_penalty_gradients_agree_with_finite_differences(free_right: HandTemplat
     )
 
 
-def test_mano_has_limits_too(mano_right: HandTemplate) -> None:
-    assert joint_limit_penalty(torch.zeros(1, 16, 3), mano_right).item() == 0.0
-
-
 def test_a_skeleton_without_a_palm_is_refused(free_right: HandTemplate) -> None:
     with pytest.raises(BadHandModel, match="one line"):
         palm_directions(np.zeros((16, 3)), "right")

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.path import Path as Polygon
 
-from hwp_bench.hands.raster import draw_faces, draw_silhouette, mix_corners, overlap
+from hwp_bench.hands.raster import draw_faces, draw_silhouette, mix_corners
 
 
 def disc(centre: np.ndarray, radius: float, corners: int = 120) -> tuple[np.ndarray, np.ndarray]:
@@ -80,9 +79,3 @@ def test_faces_behind_the_camera_or_not_finite_are_left_out() -> None:
     depth = np.array([1.0, -1.0, 1.0, 1.0, 1.0, 1.0])
     face, _ = draw_faces(pixels, depth, np.array([[0, 1, 2], [3, 4, 5]]), (8, 8))
     assert (face == -1).all()
-
-
-def test_overlap() -> None:
-    first = np.array([True, True, False, False])
-    assert overlap(first, np.array([False, True, True, False])) == pytest.approx(1 / 3)
-    assert overlap(first & False, first & False) == 1.0

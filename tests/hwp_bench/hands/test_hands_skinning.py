@@ -58,15 +58,6 @@ def test_posing_agrees_with_the_slow_loop(
         np.testing.assert_allclose(posed.joints[frame], joints, atol=tolerance)
 
 
-def test_the_free_hand_agrees_with_the_slow_loop(free_left: HandTemplate) -> None:
-    pose, betas, transl = random_parameters(1, seed=2)
-    tensors = free_left.to_torch(torch.float64)
-    posed = pose_hand(tensors, *(torch.from_numpy(x) for x in (pose, betas[0], transl)))
-    vertices, joints = slow_pose(free_left, pose[0], betas[0], transl[0])
-    np.testing.assert_allclose(posed.vertices[0], vertices, atol=1e-12)
-    np.testing.assert_allclose(posed.joints[0], joints, atol=1e-12)
-
-
 def test_zero_pose_is_the_shaped_rest_mesh(tiny_template: HandTemplate) -> None:
     betas = np.random.default_rng(3).normal(size=10)
     posed = pose_hand(
@@ -97,14 +88,6 @@ def test_transforms_carry_rest_joints_to_posed_joints(tiny_template: HandTemplat
     rest = np.concatenate([rest, np.ones((2, 16, 1))], axis=-1)
     moved = np.einsum("bjik,bjk->bji", posed.transforms.numpy(), rest)
     np.testing.assert_allclose(moved[..., :3], posed.joints, atol=1e-13)
-
-
-def test_one_shape_for_all_frames_is_the_shape_of_each(tiny_template: HandTemplate) -> None:
-    pose, betas, transl = (torch.from_numpy(x) for x in random_parameters(4))
-    tensors = tiny_template.to_torch(torch.float64)
-    shared = pose_hand(tensors, pose, betas[0], transl)
-    repeated = pose_hand(tensors, pose, betas[:1].expand(4, -1), transl)
-    torch.testing.assert_close(shared.vertices, repeated.vertices, rtol=0, atol=1e-14)
 
 
 def test_mean_pose_is_added_to_the_fingers_only_when_asked_for(
@@ -196,14 +179,6 @@ def test_pixels_agree_with_opencv() -> None:
         np.testing.assert_allclose(pixels[frame][in_front], expected[in_front, 0], rtol=1e-8)
         in_camera = points[frame].numpy() @ motion[:3, :3].T + motion[:3, 3]
         np.testing.assert_allclose(depth[frame], in_camera[:, 2], atol=1e-12)
-
-
-def test_a_point_on_the_optical_axis_is_the_principal_point() -> None:
-    pixels, depth = project(
-        torch.tensor([[[0.0, 0.0, 2.0]]]), torch.eye(4)[None], cameras(1)[1].float()
-    )
-    np.testing.assert_allclose(pixels, [[[128.0, 100.5]]])
-    assert depth.item() == 2.0
 
 
 def test_points_in_the_cameras_plane_stay_finite() -> None:

@@ -108,13 +108,6 @@ def test_a_bad_field_is_named(tmp_path: Path, field: str, value: object) -> None
     assert "MANO_RIGHT" in str(caught.value)
 
 
-def test_a_mesh_without_extent_is_refused(tmp_path: Path) -> None:
-    content = mano_content("right") | {"v_template": np.zeros((778, 3))}
-    (tmp_path / "MANO_RIGHT.pkl").write_bytes(as_published(content))
-    with pytest.raises(BadHandModel, match="one line"):
-        load_mano(tmp_path, "right")
-
-
 def test_a_selection_out_of_range_is_a_damaged_field(tmp_path: Path) -> None:
     content = mano_content("right")
     raw = as_published(content)
@@ -143,16 +136,11 @@ def test_absent_files_and_foreign_content_are_named(tmp_path: Path) -> None:
 def test_every_truncation_is_a_named_error(tmp_path: Path) -> None:
     raw = as_published(mano_content("right"))
     file = tmp_path / "MANO_RIGHT.pkl"
-    for length in np.linspace(0, len(raw) - 1, 25).astype(int):
+    for length in np.linspace(0, len(raw) - 1, 12).astype(int):
         file.write_bytes(raw[:length])
         with pytest.raises(HwpError) as caught:
             load_mano(tmp_path, "right")
         assert isinstance(caught.value, BadInput)
-
-
-def test_every_machine_finds_the_same_hand(free_right: HandTemplate) -> None:
-    assert free_right.name == "anny-1"
-    assert free_right.digest == template_sources.FREE_DIGEST
 
 
 def test_left_is_the_mirrored_right(free_right: HandTemplate, free_left: HandTemplate) -> None:
@@ -244,9 +232,6 @@ def test_unknown_sources_are_refused(source: str) -> None:
     with pytest.raises(UsageError) as caught:
         load_template(source)
     assert caught.value.field == "source"
-
-
-def test_unknown_sides_are_refused() -> None:
     with pytest.raises(UsageError) as caught:
         load_template(side="both")
     assert caught.value.field == "side"

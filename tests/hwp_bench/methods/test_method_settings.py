@@ -120,7 +120,7 @@ def test_names_come_from_the_dataclass_without_running_it(tmp_path: Path) -> Non
 
 def test_the_toolkits_own_classes_are_found_and_the_methods_come_first(tmp_path: Path) -> None:
     reference = "wildghand.model.settings:WildGHandSettings"
-    assert "schedule.dpd_rate" in class_settings(tmp_path, reference)
+    assert "schedule.epochs" in class_settings(tmp_path, reference)
     text = "@dataclass\nclass WildGHandSettings:\n    own: int = 1\n"
     (tmp_path / "wildghand").mkdir()
     assert class_settings(

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import cv2
 import numpy as np
 
-from hwp_bench.tracking.detection import HAND_EDGE, PALM_EDGE, SeenHand, anchors
+from hwp_bench.tracking.networks import HAND_EDGE, PALM_EDGE, SeenHand, anchors
 
 #: Size of the pictures, (width, height), and the discs' radius, px.
 SIZE, RADIUS = (160, 120), 9

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hwp_bench.tracking.detection import (
+from hwp_bench.tracking.networks import (
     Palm,
     Region,
     SeenHand,

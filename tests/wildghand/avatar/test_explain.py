@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
@@ -9,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from tiny_fits import TINY
+from tiny_fits import UNJUDGED
 
 import wildghand
 from hwp_bench.base.errors import UsageError
@@ -17,14 +18,14 @@ from hwp_bench.base.images import read_rgb
 from hwp_bench.capture import Capture
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import save_avatar
-from wildghand.avatar.render import explain_frames, explanation_sheet
+from wildghand.avatar.render import explain_frames, explanation_sheet, temporal_weights
 from wildghand.cli.main import main
 
 
 @pytest.fixture(scope="module")
 def fitted(make_painted: Callable[..., Capture]) -> tuple[WildGHandAvatar, Capture]:
     capture = make_painted()
-    avatar = wildghand.fit(capture.root, settings=TINY, steps=2, all_frames=True)
+    avatar = wildghand.fit(capture.root, settings=UNJUDGED, steps=2, all_frames=True)
     with torch.no_grad():
         for module in avatar.model.biases:
             module.psi.weight.zero_()
@@ -63,7 +64,9 @@ def test_the_command_writes_a_picture(fitted, tmp_path: Path, capsys) -> None:
     frame = avatar.record.frames[0]
     given = [str(tmp_path / "avatar"), str(capture.root), "--frames", str(frame), "-o", str(out)]
     assert main(["explain", *given]) == 0
-    assert "1 frames" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "1 frames" in told
+    assert "right hand: mean |omega| 0.46, rank correlation with severity not known" in told
     assert read_rgb(out).shape[1] > 4 * capture.info.width
 
 
@@ -73,7 +76,7 @@ def test_what_cannot_be_explained_is_refused(fitted) -> None:
         explain_frames(avatar, capture, [len(capture) - 1])
     bare = wildghand.fit(
         capture.root,
-        settings={**TINY, "dpd.enabled": False},
+        settings={**UNJUDGED, "dpd.enabled": False},
         steps=1,
         all_frames=True,
     )
@@ -90,3 +93,30 @@ def test_what_cannot_be_explained_is_refused(fitted) -> None:
     )
     with pytest.raises(UsageError, match="'another'"):
         explain_frames(other, capture)
+
+
+def test_temporal_weights_are_ranked_with_the_severity(fitted) -> None:
+    # Oracle: Spearman's correlation on ranks by hand, ties at their mean.
+    avatar, capture = copy.deepcopy(fitted[0]), copy.deepcopy(fitted[1])
+    count = len(capture)
+    levels = {
+        "motion_blur": [i % 4 for i in range(count)],
+        "illumination": [i % 3 for i in range(count)],
+    }
+    capture.info = dataclasses.replace(capture.info, perturbations=levels)
+    (module,) = avatar.model.biases
+    with torch.no_grad():
+        torch.nn.init.normal_(module.psi.weight, generator=torch.Generator().manual_seed(0))
+    frames = avatar.record.frames
+    omega = module.temporal(torch.arange(len(frames))).omega.abs().detach().numpy()
+    severity = np.array([frame % 4 + frame % 3 for frame in frames])
+
+    def ranks(values: np.ndarray) -> np.ndarray:
+        less, same = values[:, None] > values, values[:, None] == values
+        return less.sum(axis=1) + same.sum(axis=1) / 2
+
+    ((size, rank),) = temporal_weights(avatar, capture).values()
+    assert size == pytest.approx(omega.mean(), rel=1e-6)
+    assert rank == pytest.approx(np.corrcoef(ranks(omega), ranks(severity))[0, 1], abs=1e-9)
+    capture.info = dataclasses.replace(capture.info, perturbations={"motion_blur": None})
+    assert temporal_weights(avatar, capture)["right"][1] is None

@@ -117,7 +117,7 @@ def test_an_avatar_draws_a_pose_in_every_form_alike(tiny_avatar: WildGHandAvatar
     hand, camera = studio.angles["right"], studio.camera(48, 48)
     angles = np.zeros((16, 3))
     angles[1, 0] = 60.0
-    expected = tiny_avatar.render(studio.hands({"right": angles}), camera)
+    expected = tiny_avatar.render(studio.posed(hand.pose(angles)), camera)
     assert expected[..., 3].max() > 0.5
     for pose in ({"index1 flexion": 60.0}, hand.pose(angles), hand.pose(angles)[1:]):
         np.testing.assert_array_equal(tiny_avatar.render(pose, size=48), expected)

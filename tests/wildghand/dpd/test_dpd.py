@@ -196,3 +196,23 @@ def test_strided_attributes_give_the_biases_of_contiguous_ones() -> None:
         for g in (whole, strided)
     ]
     assert float((made[0] - made[1]).detach().abs().max()) <= 4.0 * torch.finfo().eps
+
+
+def test_the_pose_head_by_time_starts_at_rest_and_keeps_its_bounds() -> None:
+    generator = torch.Generator().manual_seed(0)
+    pose, transl = torch.rand(3, 16, 3, generator=generator), torch.rand(3, 3, generator=generator)
+    bare, module = DynamicPerturbation(6, 8), DynamicPerturbation(6, 8, poses=(0.01, 0.002))
+    z = module.temporal(torch.tensor([0, 2, 5])).z
+    for made in (bare, module):
+        moved = made.move(pose, transl, z)
+        assert torch.equal(moved[0], pose)
+        assert torch.equal(moved[1], transl)
+    head = module.pose_head
+    assert head is not None
+    torch.nn.init.normal_(head[2].weight, std=100.0)
+    moved = module.move(pose, transl, z)
+    for found, start, bound in ((moved[0], pose, 0.01), (moved[1], transl, 0.002)):
+        step = (found - start).detach().abs()
+        assert 0.9 * bound < float(step.max()) <= bound * 1.001
+        # Frames differ by their embedding alone.
+        assert not torch.equal(step[0], step[1])

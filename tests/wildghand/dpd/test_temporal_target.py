@@ -14,8 +14,8 @@ from wildghand.gaussians.attributes import RawAttributes
 SCALE, FLOOR = 0.5, 0.02
 
 
-def judged(clean: torch.Tensor, scale: float = SCALE) -> TemporalTarget:
-    return TemporalTarget.judged(clean, FLOOR + (1.0 - FLOOR) * clean, scale, FLOOR)
+def judged(clean: torch.Tensor) -> TemporalTarget:
+    return TemporalTarget.judged(FLOOR + (1.0 - FLOOR) * clean, SCALE, FLOOR)
 
 
 def episodes(count: int = 48) -> torch.Tensor:
@@ -60,7 +60,7 @@ def test_the_factor_of_pao_is_what_the_prepass_found() -> None:
     torch.testing.assert_close(1.0 / (1.0 + beta * target.omega), weights)
     assert float(target.omega.max()) == pytest.approx(SCALE)
     # Weights of 0 are no division by 0.
-    none = TemporalTarget.judged(torch.zeros(3), torch.zeros(3), SCALE, 0.0)
+    none = TemporalTarget.judged(torch.zeros(3), SCALE, 0.0)
     assert none.omega.isfinite().all()
 
 
@@ -74,16 +74,6 @@ def test_biases_begin_at_zero_and_learn_from_the_first_step() -> None:
     assert all(parameter.grad is None for parameter in learnt.parameters())
     (biases - 1.0).square().mean().backward()
     assert all(value.grad.abs().max() > 0.0 for value in learnt.varphi.parameters())
-
-
-def test_without_a_scale_the_start_is_the_papers() -> None:
-    clean, learnt = episodes(), module()
-    before = {name: value.clone() for name, value in learnt.state_dict().items()}
-    target = judged(clean, 0.0)
-    target.begin([learnt])
-    assert all(torch.equal(before[name], value) for name, value in learnt.state_dict().items())
-    assert (target.omega == 0.0).all()
-    assert torch.equal(target.hold, clean)
 
 
 def test_where_every_frame_is_clean_the_start_is_the_papers() -> None:
@@ -100,14 +90,12 @@ def test_the_start_repeats_exactly() -> None:
     assert torch.equal(omega_of(first), omega_of(second))
 
 
-def test_distance_is_the_held_square_summed_over_hands() -> None:
+def test_distance_is_the_square_summed_over_hands() -> None:
     left, right = module(10, 1), module(10, 2)
     for learnt in (left, right):
         torch.nn.init.normal_(learnt.psi.weight)
-    target = TemporalTarget(torch.linspace(0.0, 0.5, 10), torch.linspace(1.0, 0.0, 10))
-    expected = sum(
-        (target.hold * (omega_of(learnt) - target.omega) ** 2).mean() for learnt in (left, right)
-    )
+    target = TemporalTarget(torch.linspace(0.0, 0.5, 10))
+    expected = sum(((omega_of(learnt) - target.omega) ** 2).mean() for learnt in (left, right))
     torch.testing.assert_close(target.temporal_loss([left, right], 3).detach(), expected)
 
 
@@ -116,22 +104,13 @@ def test_gradient_of_the_distance_is_that_of_the_formula() -> None:
     torch.manual_seed(3)
     learnt = module(10).double()
     torch.nn.init.normal_(learnt.psi.weight)
-    target = TemporalTarget(
-        torch.linspace(0.0, 0.5, 10).double(), torch.linspace(1.0, 0.0, 10).double()
-    )
+    target = TemporalTarget(torch.linspace(0.0, 0.5, 10).double())
     weights = [*learnt.phi.parameters(), *learnt.psi.parameters()]
     found = torch.autograd.grad(3.0 * target.temporal_loss([learnt], 3), weights)
     omega = learnt.temporal(torch.arange(10)).omega
-    distance = (target.hold * (omega - target.omega) ** 2).mean()
+    distance = ((omega - target.omega) ** 2).mean()
     expected = torch.autograd.grad(3.0 * distance, weights)
     torch.testing.assert_close(found, expected, atol=1e-9, rtol=1e-9)
-
-
-def test_frames_that_are_not_held_pass_no_gradient() -> None:
-    learnt = module(10)
-    target = TemporalTarget(torch.full((10,), 0.3), torch.zeros(10))
-    target.temporal_loss([learnt], 0).backward()
-    assert all(value.grad.abs().max() == 0.0 for value in learnt.psi.parameters())
 
 
 def test_every_frame_of_a_long_clip_is_looked_at_by_some_step() -> None:
@@ -140,7 +119,7 @@ def test_every_frame_of_a_long_clip_is_looked_at_by_some_step() -> None:
     for frame in range(0, count, 7):
         omega = torch.zeros(count)
         omega[frame] = 0.5
-        target = TemporalTarget(omega, torch.ones(count))
+        target = TemporalTarget(omega)
         # Omega is zero everywhere, so that the one frame is all of the distance.
         seen = [first for first in range(count) if target.temporal_loss([learnt], first) > 0.0]
         assert frame in seen

@@ -13,10 +13,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tiny_fits import UNJUDGED
 
-from hwp_bench.base.errors import BadInput
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.avatar.files import load_avatar, save_avatar
-from wildghand.evidence import Evidence, EvidenceSettings, shown_frames, weigh_evidence
+from wildghand.evidence import (
+    ColorChanges,
+    Evidence,
+    EvidenceSettings,
+    shown_frames,
+    weigh_evidence,
+)
 from wildghand.evidence.count import _FAR, _depth_image
 from wildghand.fitting.components import make_fit
 from wildghand.gaussians.attributes import Activation, RawAttributes
@@ -128,22 +133,11 @@ def test_an_avatar_keeps_its_evidence(make_training: TrainingMaker, tmp_path: Pa
     np.testing.assert_array_equal(again.render(*where), drawn)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"evidence_offsets_right": torch.zeros(3)}, "shape"),
-        ({"evidence_shapes_right": None}, "is missing"),
-        ({"evidence_shapes_right": torch.full((4,), 1.5)}, "0 to 1"),
-        ({"evidence_offsets_right": torch.full((4,), float("nan"))}, "0 to 1"),
-        ({"evidence_wall_right": None}, "is missing"),
-    ],
-)
-def test_damaged_evidence_is_refused(change: dict[str, torch.Tensor | None], message: str) -> None:
-    tensors = {**evidence(0.5, 0.5, 4).to_tensors(), **change}
-    kept = {name: tensor for name, tensor in tensors.items() if tensor is not None}
-    with pytest.raises(BadInput, match=message):
-        Evidence.from_tensors(kept, "avatar", N={"right": 4})
-
-
-def test_an_avatar_of_before_has_none() -> None:
-    assert Evidence.from_tensors({}, "avatar", N={"right": 4}) is None
+def test_colours_alone_change() -> None:
+    generator = torch.Generator().manual_seed(0)
+    made = ColorChanges({"left": torch.randn(40, 3, generator=generator)})
+    raw = RawAttributes.split(torch.zeros(2, 40, 14))
+    changed = made.color("left", raw)
+    for name, values in changed.items():
+        expected = made.changes["left"] if name == "logit_colors" else torch.zeros(())
+        torch.testing.assert_close(values, expected.expand_as(values))

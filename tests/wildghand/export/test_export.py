@@ -33,14 +33,15 @@ from wildghand.avatar.files import save_avatar
 from wildghand.cli.main import main
 from wildghand.export.formats import FORMATS, ExportSettings, export
 from wildghand.export.mesh import quaternions, strongest
-from wildghand.export.splat_files import (
+from wildghand.export.splats import (
     FRACTIONAL_BITS,
+    SH_CONSTANT,
     GlbBuilder,
     packed_rotations,
     ply_bytes,
+    scaled,
     spz_bytes,
 )
-from wildghand.export.splats import SH_CONSTANT, scaled
 
 
 @pytest.fixture(scope="module")
@@ -85,6 +86,11 @@ def some_splats(count: int = 200, seed: int = 0) -> PosedGaussians:
         opacities=random.uniform(0.02, 0.98, count).astype(np.float32),
         colors=random.uniform(0.0, 1.0, (count, 3)).astype(np.float32),
     )
+
+
+def even(splats: PosedGaussians) -> np.ndarray:
+    """Harmonics of colours that are the same from every side."""
+    return ((splats.colors - 0.5) / SH_CONSTANT)[:, None]
 
 
 def half_turned(splats: PosedGaussians) -> PosedGaussians:
@@ -186,8 +192,8 @@ def test_an_spz_is_read_by_niantics_codec(tmp_path: Path) -> None:
     opacity, colour (of 1 / (255 * 0.15)) and log scale (1 / 16), 9 bits and a sign of a turn."""
     splats = some_splats()
     source = tmp_path / "hand.spz"
-    source.write_bytes(spz_bytes(splats))
-    assert source.read_bytes() == spz_bytes(splats)
+    source.write_bytes(spz_bytes(splats, even(splats)))
+    assert source.read_bytes() == spz_bytes(splats, even(splats))
     found = read_ply(transform(source, tmp_path / "read.ply"))
     # It gives PLY files in axes of their own: y down, z front.
     wanted = half_turned(splats)
@@ -213,7 +219,7 @@ def test_packed_rotations_name_the_largest_component(seed: int) -> None:
 
 def test_spz_refuses_what_lies_beyond_its_reach() -> None:
     with pytest.raises(UsageError, match="64 units"):
-        spz_bytes(scaled(some_splats(3), 1000.0))
+        spz_bytes(scaled(some_splats(3), 1000.0), even(some_splats(3)))
 
 
 def accessor(made: pygltflib.GLTF2, number: int) -> np.ndarray:
@@ -233,12 +239,12 @@ def attribute(made: pygltflib.GLTF2, name: str) -> np.ndarray:
 @pytest.mark.slow
 def test_a_glb_of_gaussians_is_the_one_that_splat_transform_writes(tmp_path: Path) -> None:
     """Both files are made of the same Gaussians and hold the same arrays."""
-    from wildghand.export.splat_files import EXTENSION, splat_glb_bytes
+    from wildghand.export.splats import EXTENSION, splat_glb_bytes
 
     splats = some_splats()
     mine, theirs = tmp_path / "mine.glb", tmp_path / "theirs.glb"
-    mine.write_bytes(splat_glb_bytes(half_turned(splats), "test"))
-    (tmp_path / "hand.ply").write_bytes(ply_bytes(splats))
+    mine.write_bytes(splat_glb_bytes(half_turned(splats), even(splats), "test"))
+    (tmp_path / "hand.ply").write_bytes(ply_bytes(splats, even(splats)))
     transform(tmp_path / "hand.ply", theirs)
     found, oracle = (pygltflib.GLTF2().load(str(path)) for path in (mine, theirs))
     kernels = [one.meshes[0].primitives[0].extensions[EXTENSION] for one in (found, oracle)]

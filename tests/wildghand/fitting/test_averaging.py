@@ -19,7 +19,7 @@ from painted import SilentReport
 from tiny_fits import QUICK
 
 from hwp_bench.methods.contract import Avatar, Budget, TrainingCapture
-from wildghand.fitting.choice import AveragedAvatar, Averaging, StepAverage
+from wildghand.fitting.choice import AveragedAvatar, Averaging
 from wildghand.fitting.components import make_fit
 from wildghand.gaussians.fit_loop import batches, repeatable
 from wildghand.model.settings import read_settings
@@ -43,7 +43,7 @@ def weights_of(steps: int, share: float) -> np.ndarray:
 def averaged(steps: int, share: float) -> np.ndarray:
     """(steps,) weights that the average gives: tensor t is one at its place."""
     tensor = torch.zeros(steps, dtype=torch.float64)
-    average = StepAverage([tensor], share)
+    average = Averaging([tensor], share)
     for t in range(steps):
         tensor.zero_()[t] = 1.0
         average.take()
@@ -73,7 +73,7 @@ def test_a_tenth_counts_most_of_the_last_tenth_whenever_it_ends() -> None:
 
 def test_in_place_gives_every_bit_back() -> None:
     tensor = torch.arange(5.0)
-    average = StepAverage([tensor], 0.5)
+    average = Averaging([tensor], 0.5)
     for _ in range(3):
         tensor.mul_(1.1)
         average.take()
@@ -129,8 +129,8 @@ def test_a_checkpoint_is_drawn_as_a_fit_that_ends_there(make_training: TrainingM
     with repeatable(CPU):
         for step in range(10):
             fit.step(next(order), step / 24)
-            part(fit, Averaging).average.take()
-    part(fit, Averaging).average.put()
+            part(fit, Averaging).take()
+    part(fit, Averaging).put()
     ended = fit.avatar(10).render(training.hand_poses(0), training.camera(0))
     np.testing.assert_array_equal(drawn[10], ended)
     assert np.abs(drawn[0] - ended).max() > 0.05

@@ -25,7 +25,7 @@ from wildghand.export.formats import ExportSettings, export
 from wildghand.fitting import start
 from wildghand.fitting.method import WildGHandMethod
 from wildghand.model import terms
-from wildghand.page.poses import PageSettings, sample_poses
+from wildghand.page.write import PageSettings, sample_poses
 from wildghand.poses import ClipPoses
 from wildghand.viewer.posed_view import Motion
 
@@ -43,9 +43,7 @@ def _bent(hands: dict[str, HandParameters]) -> dict[str, HandParameters]:
 @pytest.fixture
 def believing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fits believe in bent fingers."""
-    monkeypatch.setattr(
-        start, "believed_hands", lambda templates, hands, cameras, settings: _bent(hands)
-    )
+    monkeypatch.setattr(start, "believed_hands", lambda templates, hands, cameras: _bent(hands))
 
 
 def _fitted(training: TrainingCapture, **changes: object) -> WildGHandAvatar:

@@ -34,9 +34,9 @@ def test_the_light_gets_the_seconds_that_it_takes(
 ) -> None:
     now = 100.0
 
-    def slow(model: object, clip: object, weights: torch.Tensor, count: int, seed: int) -> int:
+    def slow(fit: Fit, frames: int, count: int) -> int:
         nonlocal now
-        now += 0.5 + 0.1 * len(weights)
+        now += 0.5 + 0.1 * frames
         return count
 
     monkeypatch.setattr(closing, "light_samples", slow)

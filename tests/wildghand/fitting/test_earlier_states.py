@@ -22,7 +22,7 @@ from tiny_fits import UNJUDGED
 from hwp_bench.capture.splits import Split
 from hwp_bench.methods.contract import Budget, TrainingCapture
 from wildghand.avatar.files import load_avatar, save_avatar
-from wildghand.fitting.choice import Averaging, EarlierStates, StateChoice, StepAverage
+from wildghand.fitting.choice import Averaging, StateChoice
 from wildghand.fitting.components import make_fit
 from wildghand.fitting.fit import Fit
 from wildghand.model.settings import read_settings
@@ -34,11 +34,11 @@ CPU = torch.device("cpu")
 FIT: dict[str, Any] = {**UNJUDGED, "schedule.steps": 20}
 
 
-def counted(steps: int, first: int, share: float = 1.0) -> tuple[torch.Tensor, EarlierStates]:
+def counted(steps: int, first: int, share: float = 1.0) -> tuple[torch.Tensor, StateChoice]:
     """A fit whose tensor is the number of its step."""
     tensor = torch.zeros(3, dtype=torch.float64)
-    average = StepAverage([tensor], share)
-    states = EarlierStates(average, first)
+    average = Averaging([tensor], share)
+    states = StateChoice(average, first)
     for step in range(1, steps + 1):
         tensor.fill_(step)
         average.take()
@@ -61,7 +61,7 @@ def test_states_double_up_to_half_of_the_steps(steps: int, first: int) -> None:
 @pytest.mark.parametrize("share", [0.0, 0.1, 1.0])
 def test_a_state_is_the_mean_of_the_steps_until_then(share: float) -> None:
     tensor, states = counted(40, 5, share)
-    states.choose(lambda: abs(float(tensor[0]) - float(counted(10, 99, share)[0][0])))
+    states.go_back(lambda: abs(float(tensor[0]) - float(counted(10, 99, share)[0][0])))
     assert torch.equal(tensor, counted(10, 99, share)[0])
 
 
@@ -76,7 +76,7 @@ def test_it_goes_back_as_long_as_errors_fall(errors: list[float]) -> None:
         asked.append(round(place_of(tensor)))
         return errors[places.index(asked[-1])]
 
-    chosen = states.choose(error)
+    chosen = states.go_back(error)
     last = next((k for k in range(3) if errors[k + 1] >= errors[k]), 3)
     assert (chosen or 40) == places[last] == round(place_of(tensor))
     # One error beyond the best is looked at, and none after that.
@@ -85,13 +85,13 @@ def test_it_goes_back_as_long_as_errors_fall(errors: list[float]) -> None:
 
 def test_an_error_that_is_not_finite_is_never_gone_back_to() -> None:
     tensor, states = counted(40, 5)
-    assert states.choose(lambda: 1.0 if place_of(tensor) == 40 else math.nan) is None
+    assert states.go_back(lambda: 1.0 if place_of(tensor) == 40 else math.nan) is None
     assert place_of(tensor) == 40
 
 
 def test_a_short_fit_asks_for_nothing() -> None:
     tensor, states = counted(9, 5)
-    assert states.choose(lambda: pytest.fail("nothing is to be chosen")) is None
+    assert states.go_back(lambda: pytest.fail("nothing is to be chosen")) is None
     assert place_of(tensor) == 9
     states.forget()
     assert states.candidates == []
@@ -100,14 +100,14 @@ def test_a_short_fit_asks_for_nothing() -> None:
 def test_a_saved_state_goes_on_as_if_never_stopped(tmp_path: Path) -> None:
     tensor, states = counted(23, 5)
     torch.save(states.state_dict(), tmp_path / "state.pt")
-    average = StepAverage([tensor], 1.0)
-    again = EarlierStates(average, 5)
+    average = Averaging([tensor], 1.0)
+    again = StateChoice(average, 5)
     again.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
     assert again.candidates == states.candidates == [10, 5]
     for _ in range(17):
         again.take()
     assert again.candidates == [20, 10, 5]
-    again.choose(lambda: abs(place_of(tensor) - 10))
+    again.go_back(lambda: abs(place_of(tensor) - 10))
     assert place_of(tensor) == 10
 
 
@@ -133,14 +133,14 @@ def fitted(
     means: dict[int, list[torch.Tensor]] = {}
 
     def error() -> float:
-        now = part(fit, Averaging).average.now()
+        now = part(fit, Averaging).now()
         for step, mean in means.items():
             if all(torch.equal(a, b) for a, b in zip(now, mean, strict=True)):
                 return abs(math.log(step / wanted))
         pytest.fail("the tensors are no state of the fit")
 
     def watch(step: int, watchers: object, loss: object) -> None:
-        means[step] = part(fit, Averaging).average.values()
+        means[step] = part(fit, Averaging).values()
 
     monkeypatch.setattr(StateChoice, "error", lambda choice: error())
     report = SilentReport()
@@ -154,10 +154,8 @@ def test_a_fit_ends_with_the_state_that_draws_validation_frames_best(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     fit, avatar, means = fitted(training, monkeypatch, 5)
-    assert part(fit, StateChoice).states.candidates == [10, 5]
-    assert all(
-        torch.equal(a, b) for a, b in zip(part(fit, Averaging).average.now(), means[5], strict=True)
-    )
+    assert part(fit, StateChoice).candidates == [10, 5]
+    assert all(torch.equal(a, b) for a, b in zip(part(fit, Averaging).now(), means[5], strict=True))
     assert (avatar.record.steps, avatar.record.chosen_steps) == (20, 5)
     assert "The state of step 5 draws the validation frames best" in capsys.readouterr().err
     again = load_avatar(save_avatar(avatar, tmp_path / "avatar"))
@@ -183,8 +181,7 @@ def test_without_the_choice_a_fit_ends_with_its_last_state(
     fit, avatar, means = fitted(training, monkeypatch, 5, **changes)
     assert avatar.record.chosen_steps is None
     assert all(
-        torch.equal(a, b)
-        for a, b in zip(part(fit, Averaging).average.now(), means[20], strict=True)
+        torch.equal(a, b) for a, b in zip(part(fit, Averaging).now(), means[20], strict=True)
     )
     assert fit.part(StateChoice) is None
 
@@ -195,7 +192,7 @@ def test_the_seconds_of_the_choice_are_left_out_of_the_steps(
     """The report's clock runs one second for each step, and one for the start."""
     monkeypatch.setattr(Fit, "seconds_for_steps", lambda fit, seconds: seconds)
     monkeypatch.setattr(
-        StateChoice, "seconds_now", lambda choice, fit: 3.0 * (len(choice.states.candidates) > 0)
+        StateChoice, "seconds_now", lambda choice, fit: 3.0 * (len(choice.candidates) > 0)
     )
     _, avatar, _ = fitted(training, monkeypatch, 20, Budget(seconds=16.0))
     assert avatar.record.steps == 16 - 1 - 3
@@ -205,9 +202,9 @@ def test_seconds_are_asked_for_once_there_are_states(training: TrainingCapture) 
     fit = make_fit(training, read_settings(FIT), 0, CPU)
     assert part(fit, StateChoice).seconds_now(fit) == 0.0
     for _ in range(10):
-        part(fit, Averaging).average.take()
-        part(fit, StateChoice).states.take()
-    assert part(fit, StateChoice).states.candidates == [5]
+        part(fit, Averaging).take()
+        part(fit, StateChoice).take()
+    assert part(fit, StateChoice).candidates == [5]
     before = {name: value.clone() for name, value in fit.model.state_dict().items()}
     assert part(fit, StateChoice).seconds_now(fit) > 0.0
     assert all(torch.equal(value, before[name]) for name, value in fit.model.state_dict().items())

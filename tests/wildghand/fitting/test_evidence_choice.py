@@ -29,6 +29,7 @@ from wildghand.evidence import (
 )
 from wildghand.fitting.choice import StateChoice
 from wildghand.fitting.colors import FilledColors
+from wildghand.fitting.data import FitData
 from wildghand.fitting.evidence import FewShown, Gaps
 from wildghand.fitting.fit import Fit
 from wildghand.gaussians.training import load_validation_frames
@@ -321,7 +322,7 @@ def test_nothing_is_chosen_where_it_is_off(
     changes: dict[str, Any], training: TrainingCapture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if "validated" in changes:
-        monkeypatch.setattr(EvidenceSettings, "validated", False)
+        monkeypatch.setattr(FitData, "judges", None)
         changes = {}
     fit = begun(training, **changes)
     choice = fit.part(FewShown)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,21 +16,24 @@ from tiny_fits import UNJUDGED
 from hwp_bench.hands import load_template
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.avatar.files import load_avatar, save_avatar
-from wildghand.evidence import EvidenceSettings
 from wildghand.fitting.colors import (
     FilledColors,
-    OtherHand,
     known_logits,
+    known_normals,
     log_linear,
     roughness,
     smooth_fill,
 )
+from wildghand.fitting.data import FitData
 from wildghand.fitting.evidence import FewShown
 from wildghand.fitting.fit import Fit
+from wildghand.gaussians.attributes import CHANNELS, SIZES
 from wildghand.gaussians.regularizers import nearest_on_surface, rest_anchors
 from wildghand.gaussians.rig import HandRig, make_rig
 
 PLAIN: dict[str, Any] = {**UNJUDGED, "shadows.enabled": False, "start_colors": False}
+# Channels of the colours in the attributes and in the map.
+COLORS = slice(CHANNELS - SIZES["logit_colors"], CHANNELS)
 TrainingMaker = Callable[..., TrainingCapture]
 
 
@@ -105,24 +109,58 @@ def test_the_changes_lead_to_the_filled_colours(make_training: TrainingMaker) ->
     np.testing.assert_allclose(after, expected, atol=2e-3)
 
 
-def test_colours_from_the_other_hand_are_known_and_carried_on(
-    make_training: TrainingMaker,
-) -> None:
+@pytest.fixture
+def hands(make_training: TrainingMaker) -> Fit:
+    """Two hands of other colours."""
     fit = begun(make_training("both"))
+    with torch.no_grad():
+        fit.model.network.identity.maps["left"][:, COLORS] += 0.5
+    return fit
+
+
+def known_of(fit: Fit, **known: float) -> FilledColors:
+    """A fill for which so much is known of each hand."""
+    half = 0.02 * len(fit.data.frames)
+    frames = {side: half * share / (1.0 - share) for side, share in known.items()}
     counts = {side: len(rig) for side, rig in fit.model.rigs.items()}
-    # No frame shows the left hand, and the right one knows all colours.
-    own = {"left": np.zeros(counts["left"]), "right": np.ones(counts["right"])}
-    other = part(fit, OtherHand)
-    other.own = other.lent = own
-    taken = other.learn(fit)
-    assert taken is not None
-    fit.model.keep(taken)
-    shown = {side: torch.zeros(count) for side, count in counts.items()}
-    shown["right"] += 1e9
-    found = FilledColors(fit, shown).carried_on([0.02])[0]
+    return FilledColors(fit, {s: torch.full((counts[s],), n) for s, n in frames.items()})
+
+
+@pytest.mark.parametrize("share", [0.02, 0.1, 0.0])
+def test_a_hand_that_nothing_shows_takes_the_others_colours(share: float, hands: Fit) -> None:
+    (found,) = known_of(hands, left=0.0, right=0.999).carried_on([share])
     assert found is not None
-    for side, change in taken.changes.items():
-        np.testing.assert_allclose(found.changes[side].numpy(), change.numpy(), atol=1e-4)
+    before = {side: levels(hands, side) for side in ("left", "right")}
+    assert np.abs(before["left"] - before["right"]).mean() > 0.1
+    after = levels(hands, "left", found.changes["left"])
+    np.testing.assert_allclose(after, before["right"], atol=5e-3)
+    np.testing.assert_allclose(found.changes["right"], 0.0, atol=5e-3)
+
+
+def test_the_mixture_is_by_what_is_known_of_each(hands: Fit) -> None:
+    (found,) = known_of(hands, left=0.3, right=0.8).carried_on([0.0])
+    assert found is not None
+    before = {side: levels(hands, side) for side in ("left", "right")}
+    # What is lent takes a quarter of the frames: odds of 0.8 are 4, of what is lent 16.
+    share = 0.7 * 16.0 / 17.0
+    expected = (1.0 - share) * before["left"] + share * before["right"]
+    np.testing.assert_allclose(levels(hands, "left", found.changes["left"]), expected, atol=2e-3)
+
+
+def test_hands_that_frames_show_keep_their_colours(hands: Fit) -> None:
+    (found,) = known_of(hands, left=0.999, right=0.999).carried_on([0.02])
+    assert found is not None
+    for change in found.changes.values():
+        np.testing.assert_allclose(change, 0.0, atol=5e-3)
+
+
+def test_where_it_is_off_hands_have_nothing_of_each_other(make_training: TrainingMaker) -> None:
+    fit = begun(make_training("both"), **{"evidence.other_hand": False})
+    filled = known_of(fit, left=0.0, right=0.999)
+    changed, none = filled.carried_on([0.02, 0.0])
+    assert none is None
+    assert changed is not None
+    np.testing.assert_allclose(changed.changes["left"], 0.0, atol=1e-4)
 
 
 @pytest.mark.parametrize("changes", [{"evidence.fill_share": 0.0}, {"evidence.enabled": False}])
@@ -144,7 +182,7 @@ def test_nothing_is_filled_without_a_light(make_training: TrainingMaker) -> None
 def test_without_judges_the_settings_share_holds_and_an_avatar_keeps_it(
     make_training: TrainingMaker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(EvidenceSettings, "validated", False)
+    monkeypatch.setattr(FitData, "judges", None)
     fit = begun(make_training(), **{"light.enabled": False})
     (expected,) = part(fit, FewShown).filled.carried_on([0.02])
     assert expected is not None
@@ -158,3 +196,11 @@ def test_without_judges_the_settings_share_holds_and_an_avatar_keeps_it(
     assert np.abs(drawn - before).max() > 0.01
     again = load_avatar(save_avatar(fit.avatar(0), tmp_path / "avatar"))
     np.testing.assert_array_equal(again.render(*where), drawn)
+
+
+def test_known_normals_lie_in_the_cap() -> None:
+    normals = known_normals(a_light(0.5)).double().numpy()
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-6)
+    np.testing.assert_allclose(
+        normals[:, 2], [-1.0] + 4 * [-math.cos(0.6 * math.pi / 3)], atol=1e-6
+    )

@@ -34,8 +34,8 @@ STEPS = 60
 VARIANTS: dict[str, dict[str, Any]] = {
     "default": {},
     "two hands": {},
-    "paper": {"mode": "paper"},
-    "released": {"mode": "released"},
+    "paper": {"mode": "paper", "schedule.epochs": 0},
+    "released": {"mode": "released", "schedule.epochs": 0},
     "batch of 4": {"schedule.batch": 4},
     "mixed precision": {"mixed_precision": True},
 }

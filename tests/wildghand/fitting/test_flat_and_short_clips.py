@@ -53,9 +53,14 @@ def flat(training: TrainingCapture, colour: tuple[int, int, int]) -> TrainingCap
 
 
 @pytest.mark.parametrize(
-    "changes", [{"mode": "paper"}, {"mode": "released"}, {"prepass.enabled": False}], ids=str
+    ("colour", "changes"),
+    [
+        *[(COLOURS[0], {"mode": mode, "schedule.epochs": 1}) for mode in ("paper", "released")],
+        (COLOURS[2], {"mode": "paper", "schedule.epochs": 1}),
+        *[(colour, {"prepass.enabled": False}) for colour in COLOURS],
+    ],
+    ids=str,
 )
-@pytest.mark.parametrize("colour", COLOURS, ids=str)
 def test_a_clip_of_one_colour_gives_a_finite_avatar(
     colour: tuple[int, int, int], changes: dict[str, Any], make_training: TrainingMaker
 ) -> None:

@@ -95,7 +95,7 @@ def test_the_binary_mask_is_the_hand_that_was_chosen(
     found = weights(training, **binary, **{"pao.hand": hand})
     settings = read_settings({**FIT, **binary})
     fit = make_fit(training, settings, 0, torch.device("cpu"))
-    masks = hand_masks(training, fit.data.frames, hand, torch.device("cpu"))
+    masks = hand_masks(fit.data, hand, torch.device("cpu"))
     assert torch.equal(found, (masks[:3] > 127).float())
     assert not torch.equal(masks, fit.data.frames.masks)
     if source == "graph-cut":  # the painted hand is where its parameters say, and alone
@@ -180,7 +180,6 @@ def test_an_ablation_takes_the_networks_too(
     folder: Path, make_painted: Callable[..., Capture], tmp_path: Path, capsys: Any
 ) -> None:
     settings = {**FIT, "mode": "paper", "pao.hand": f"sam:{folder / 'sam.pth'}"}
-    settings["pao.regions"] = f"sam:{folder / 'sam.pth'}"
     command = ["ablate", "--binary-mask", "--seeds", "1", "-o", str(tmp_path / "runs")]
     command += ["--capture", str(make_painted().root), *options(settings)]
     assert hwp_bench(command) == 0, capsys.readouterr().err

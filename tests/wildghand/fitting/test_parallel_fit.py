@@ -34,14 +34,14 @@ from wildghand.fitting.session import load_state, save_state
 from wildghand.model.settings import read_settings
 from wildghand.plain.loop import Watchers, run_fit
 
+QUICK: dict[str, Any] = {**UNJUDGED, "shadows.enabled": False}
 SHORT: dict[str, Any] = {**TINY, "schedule.steps": 4, "schedule.batch": 2}
 VARIANTS: dict[str, dict[str, Any]] = {
     "default": {},
     # What precedes the first step is the same in all processes, and compared in the default.
-    "pay back": {**UNJUDGED, "dpd.pay_back": 1.5},
-    # The weights compare the frames of a batch, and omega learns from their size.
+    "unjudged": QUICK,
     # Three frames in ten keep no biases: processes must draw the same chances.
-    "paper": {"mode": "paper"},
+    "paper": {"mode": "paper", "schedule.epochs": 0},
 }
 TrainingMaker = Callable[..., TrainingCapture]
 State = dict[str, torch.Tensor]
@@ -59,7 +59,7 @@ def fitted(request: Path, changes: dict[str, Any], world: World) -> tuple[State,
 
 def resumed(request: Path, world: World, state: Path) -> State:
     """Two steps, a saved state, and the rest from it."""
-    settings = read_settings({**SHORT, **VARIANTS["default"]})
+    settings = read_settings({**SHORT, **VARIANTS["unjudged"]})
     half, watchers = make_fit(open_request(request), settings, 0, CPU, world), Watchers(0)
 
     def save(step: int, watched: Watchers, loss: object) -> None:
@@ -83,7 +83,7 @@ class NanLoss(Component):
 
 def check_spoiled(request: Path, world: World) -> None:
     """A loss that is NaN in one process only stops the step in all of them."""
-    settings = read_settings(SHORT)
+    settings = read_settings({**SHORT, **QUICK})
     fit = make_fit(open_request(request), settings, 0, CPU, world)
     before = fit.model.snapshot()
     if world.rank == 1:
@@ -119,7 +119,7 @@ def process(rank: int, ports: tuple[int, int], folder: Path) -> None:
     def work(world: World) -> int:
         request = folder / "request"
         found = {name: fitted(request, changes, world)[1] for name, changes in VARIANTS.items()}
-        found["again"] = fitted(request, VARIANTS["default"], world)[1]
+        found["again"] = fitted(request, VARIANTS["unjudged"], world)[1]
         found["resumed"] = resumed(request, world, folder / "state")
         check_spoiled(request, world)
         with pytest.raises(HwpError, match="process 1 of 2 starts from another state"):
@@ -188,7 +188,7 @@ def test_processes_agree_repeat_and_go_on_bit_for_bit(folder: Path) -> None:
     for name, state in first.items():
         assert all(torch.equal(value, second[name][key]) for key, value in state.items()), name
     for name in ("again", "resumed"):
-        assert all(torch.equal(v, first[name][key]) for key, v in first["default"].items()), name
+        assert all(torch.equal(v, first[name][key]) for key, v in first["unjudged"].items()), name
 
 
 def torchrun(arguments: list[str]) -> subprocess.CompletedProcess[str]:
@@ -211,7 +211,9 @@ def test_torchrun_makes_one_avatar_and_one_message(
     make_painted: Callable[..., Capture], tmp_path: Path
 ) -> None:
     capture, avatar = make_painted().root, tmp_path / "avatar"
-    options = [word for name, value in SHORT.items() for word in ("--set", f"{name}={value}")]
+    options = [
+        word for name, value in (SHORT | QUICK).items() for word in ("--set", f"{name}={value}")
+    ]
     command = ["fit", str(capture), "-o", str(avatar), "--steps", "2", *options]
     made = torchrun(command)
     assert made.returncode == 0, made.stderr

@@ -22,18 +22,21 @@ from wildghand.model.settings import ScheduleSettings, read_settings
 def test_rates_fall_geometrically_and_with_the_root_of_the_steps(
     fraction: float, steps: int, factor: float
 ) -> None:
-    assert rate_factor(ScheduleSettings(), fraction, steps) == pytest.approx(factor, rel=1e-12)
+    found = rate_factor(ScheduleSettings(), fraction, steps, 1.0)
+    assert found == pytest.approx(factor, rel=1e-12)
 
 
 def test_without_the_root_only_the_share_of_the_budget_counts() -> None:
     schedule = ScheduleSettings(decay="geometric")
-    assert rate_factor(schedule, 0.5, 10_000) == pytest.approx(0.05**0.5, rel=1e-12)
+    assert rate_factor(schedule, 0.5, 10_000, 1.0) == pytest.approx(0.05**0.5, rel=1e-12)
 
 
-def test_halving_halves_at_even_shares() -> None:
-    schedule = ScheduleSettings(decay="halving")
-    found = [rate_factor(schedule, share, 7) for share in (0.0, 0.05, 0.1, 0.99)]
-    assert found == [1.0, 1.0, 0.5, 0.5**9]
+@pytest.mark.parametrize("rates", ["paper", "released"])
+def test_published_rates_are_halved_every_five_epochs_whatever_the_budget(rates: str) -> None:
+    # 48 frames, 4 a step: 12 steps an epoch.
+    schedule = ScheduleSettings(rates=rates)
+    found = [rate_factor(schedule, 0.7, steps, 12.0) for steps in (0, 59, 60, 119, 120, 599)]
+    assert found == [1.0, 1.0, 0.5, 0.5, 0.25, 0.5**9]
 
 
 def test_every_group_falls_from_its_own_rate(make_training: Callable[..., TrainingCapture]) -> None:

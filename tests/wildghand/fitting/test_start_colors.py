@@ -17,7 +17,7 @@ from wildghand.evidence.count import read_images, seen_anchors
 from wildghand.fitting.colors import start_from_colors, tint_share
 from wildghand.fitting.components import make_fit
 from wildghand.fitting.fit import Fit
-from wildghand.fitting.light import Shadows, best_of_each_part
+from wildghand.fitting.light import Lighting, best_of_each_part
 from wildghand.gaussians.training import TrainingFrames
 from wildghand.light import CastLight, ShadowTable
 from wildghand.model.settings import read_settings
@@ -101,7 +101,7 @@ def test_light_and_shadows_are_no_tint(make_training: TrainingMaker) -> None:
     fit.model.keep(CastLight(np.array([[0.0, 0.0, -1.0]], np.float32), strong, 0.3))
     size = fit.data.training.width, fit.data.training.height
     assert fit.model.shadows is not None
-    part(fit, Shadows)._table = ShadowTable(fit.model.shadows, fit.clip)
+    part(fit, Lighting)._table = ShadowTable(fit.model.shadows, fit.clip)
     with torch.no_grad():
         drawn = fit.model.draw_frames(fit.clip, torch.arange(len(fit.data.frames)), *size)
     images = (255.0 * drawn.image.clamp(0.0, 1.0)).round().byte()
@@ -109,7 +109,7 @@ def test_light_and_shadows_are_no_tint(make_training: TrainingMaker) -> None:
     before = fit.model.network.identity.maps["right"].clone()
     start_on(fit, frames)
     moved = (fit.model.network.identity.maps["right"] - before).abs()
-    fit.model.shadows = part(fit, Shadows)._table = None
+    fit.model.shadows = part(fit, Lighting)._table = None
     start_on(fit, frames)
     misled = (fit.model.network.identity.maps["right"] - before).abs()
     assert float(moved.mean()) < 0.2 * float(misled.mean())

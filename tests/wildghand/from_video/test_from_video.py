@@ -30,9 +30,9 @@ from hwp_bench.importers.shared.landmarks import read_hand_tracks, write_hand_tr
 from hwp_bench.tracking.networks import HAND, PALM, models_folder
 from wildghand.avatar.files import load_avatar
 from wildghand.cli.main import main
-from wildghand.from_video import VideoFit, make_avatar, pictures
-from wildghand.from_video.job import QUICK as QUICK_CHANGES
-from wildghand.from_video.job import QUICK_FRAMES, Job, with_quick
+from wildghand.from_video import VideoFit, make_avatar, stages
+from wildghand.from_video.run import QUICK as QUICK_CHANGES
+from wildghand.from_video.run import QUICK_FRAMES, Job, with_quick
 from wildghand.from_video.stages import STAGES, import_options, stride
 from wildghand.model.settings import read_settings
 
@@ -69,7 +69,7 @@ def choices(folder: Path, **changes: Any) -> VideoFit:
 def small_turntable() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for name, value in zip(("SIZE", "FRAMES"), SMALL, strict=True):
-            patch.setattr(pictures, name, value)
+            patch.setattr(stages, name, value)
         yield
 
 
@@ -171,9 +171,9 @@ from pathlib import Path
 sys.path[:0] = sys.argv[4:]
 from test_from_video import SMALL, choices
 from wildghand.fitting import session
-from wildghand.from_video import make_avatar, pictures, run, stages
+from wildghand.from_video import make_avatar, run, stages
 folder, out, where = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3]
-pictures.SIZE, pictures.FRAMES = SMALL
+stages.SIZE, stages.FRAMES = SMALL
 def die(*args, **more):
     os.kill(os.getpid(), signal.SIGKILL)
 if where == "fit":
@@ -186,7 +186,7 @@ if where == "fit":
 elif where == "import":
     stages.import_video = die
 elif where == "turntable":
-    pictures.as_uint8 = die
+    stages.as_uint8 = die
 elif where == "between":
     write = run.write_record
     def write_and_die(path, record):
@@ -255,9 +255,9 @@ def test_the_command(folder: Path, capsys, monkeypatch: pytest.MonkeyPatch) -> N
     record["source"]["video"] |= {"ends_early": True, "warning": "ends early, after 12 of 24"}
     (capture / "capture.json").write_text(json.dumps(record))
     labels: list[str] = []
-    labelled = pictures.labelled
+    labelled = stages.labelled
     monkeypatch.setattr(
-        pictures, "labelled", lambda tile, text: labels.append(text) or labelled(tile, text)
+        stages, "labelled", lambda tile, text: labels.append(text) or labelled(tile, text)
     )
     (folder / "my_hand" / "sheet.jpg").unlink()
     assert main([*words, "-o", str(folder / "my_hand")]) == 0

@@ -10,11 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hwp_bench.base.errors import BadInput, HwpError
-from wildghand.from_video.job import Job, VideoFit
 from wildghand.from_video.run import (
+    Job,
     JobRecord,
     Stage,
     StageRecord,
+    VideoFit,
     read_record,
     run_stages,
     seconds_left,

@@ -13,7 +13,7 @@ from hwp_bench.methods.contract import Budget, TrainingCapture
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import write_weight_masks
 from wildghand.fitting.method import WildGHandMethod
-from wildghand.from_video.pictures import BACKGROUND, COLUMNS, Turntable, avatar_sheet
+from wildghand.from_video.stages import BACKGROUND, COLUMNS, Turntable, avatar_sheet
 
 SIZE = 96
 ANGLES = (0, 45, 90, 135, 180, 225, 270, 315)

@@ -94,13 +94,31 @@ def test_a_state_that_torch_saved_goes_on() -> None:
             torch.testing.assert_close(saved[number][name], value)
 
 
-def test_a_gradient_that_is_no_number_is_not_passed_over() -> None:
-    tensors = [torch.zeros(64, requires_grad=True)]
-    optimizer = ClippedAdam([{"params": tensors, "lr": 0.1}], 1.0)
-    tensors[0].grad = torch.zeros(64)
-    tensors[0].grad[17] = math.nan
-    optimizer.take_step(torch.zeros(()))
-    assert tensors[0][17].isnan()
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("clipped", [True, False])
+@pytest.mark.parametrize("step", ["_step_compiled", "_step_on_device"])
+def test_a_gradient_that_is_no_number_skips_the_step(bad: float, clipped: bool, step: str) -> None:
+    tensors = parameters()
+    optimizer = ClippedAdam(groups(tensors), 1.0)
+    place = next(
+        group["params"][0]
+        for group in optimizer.param_groups
+        if group.get("clipped", True) == clipped
+    )
+    take = getattr(optimizer, step)
+    given = () if step == "_step_compiled" else (torch.zeros(()),)
+    give_gradients(tensors, 0)
+    take(*given)
+    before = [tensor.detach().clone() for tensor in tensors]
+    give_gradients(tensors, 1)
+    assert place.grad is not None
+    place.grad.view(-1)[-1] = bad
+    take(*given)
+    assert all(torch.equal(a, b) for a, b in zip(tensors, before, strict=True))
+    assert float(optimizer.state[tensors[0]]["step"]) == 1.0
+    give_gradients(tensors, 2)
+    take(*given)
+    assert largest_difference(tensors, before) > 1e-3
 
 
 @pytest.mark.parametrize("loss", [math.nan, math.inf])

@@ -12,7 +12,7 @@ from benchmarks.cast_light import lamps_of, rows_of, white_hands
 from hwp_bench.capture import Capture
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.light import CastLight
-from wildghand.light.lights import ring_around, spread_directions
+from wildghand.light.light import ring_around, spread_directions
 
 
 def a_light(strength: float) -> CastLight:

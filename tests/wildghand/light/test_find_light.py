@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from wildghand.light import CastLight, ShadowSamples, ShadowSettings, find_light
-from wildghand.light.lights import ring_around, spread_directions
+from wildghand.light import CastLight, LightSamples, find_light
+from wildghand.light.light import ring_around, spread_directions
 
 LAMPS = np.array([[0.55, -0.6, -0.58], [-0.7, -0.2, -0.69]])
 LAMPS /= np.linalg.norm(LAMPS, axis=1, keepdims=True)
@@ -29,7 +29,7 @@ def free(points: np.ndarray, directions: np.ndarray) -> np.ndarray:
 
 def samples(
     count: int = 6000, seed: int = 0, lamps: np.ndarray = LAMPS, shadows: bool = True
-) -> tuple[ShadowSamples, np.ndarray]:
+) -> tuple[LightSamples, np.ndarray]:
     """Places of random albedo near a plane that turn towards -z and move, and their points."""
     random = np.random.default_rng(seed)
     normals = random.normal(size=(count, 3)) * [1.0, 1.0, 0.6] - [0.0, 0.0, 0.8]
@@ -41,7 +41,7 @@ def samples(
     strengths = STRENGTHS[: len(lamps)]
     irradiance = AMBIENT + (np.maximum(normals @ lamps.T, 0.0) * arrives) @ strengths
     light = albedo[places] * irradiance * random.normal(1.0, 0.03, count)
-    made = ShadowSamples(
+    made = LightSamples(
         places, normals, light, np.ones(count), lambda directions: free(points, directions)
     )
     return made, points
@@ -61,7 +61,7 @@ def lamps_of(light: CastLight) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def found() -> CastLight:
-    light = find_light(samples()[0], ShadowSettings())
+    light = find_light(samples()[0])
     assert light is not None
     return light
 
@@ -79,7 +79,7 @@ def test_lamps_are_found_where_they_are(found: CastLight) -> None:
 def test_shadows_are_as_dark_as_they_are(found: CastLight) -> None:
     seen, points = samples(seed=9)
     # Without softness, as the truth has none.
-    hard = find_light(samples()[0], ShadowSettings(), softness=0.0)
+    hard = find_light(samples()[0], softness=0.0)
     assert hard is not None
     dark = hard.darkening(seen.normals, free(points, hard.directions), 0.0) ** 2.2
     off = dark - truth(seen.normals, points)
@@ -91,11 +91,11 @@ def test_shadows_are_as_dark_as_they_are(found: CastLight) -> None:
 
 def test_every_further_lamp_must_explain_something() -> None:
     one, _ = samples(lamps=LAMPS[:1])
-    light = find_light(one, ShadowSettings())
+    light = find_light(one)
     assert light is not None
     strong = light.strengths[:-48].reshape(-1, 7).sum(axis=1)
     assert int((strong > 0.1 * strong.max()).sum()) == 1
-    none = find_light(one, ShadowSettings(lamps=0))
+    none = find_light(one, lamps=0)
     assert none is not None
     assert len(none.directions) == 48
 
@@ -104,7 +104,7 @@ def test_gross_errors_change_little(found: CastLight) -> None:
     seen, _ = samples()
     wrong = seen.light.copy()
     wrong[::12] *= 5.0
-    light = find_light(dataclasses.replace(seen, light=wrong), ShadowSettings())
+    light = find_light(dataclasses.replace(seen, light=wrong))
     assert light is not None
     assert (lamps_of(light) @ LAMPS.T).max(axis=0).min() > np.cos(np.radians(6.0))
 
@@ -112,7 +112,7 @@ def test_gross_errors_change_little(found: CastLight) -> None:
 @pytest.mark.parametrize("value", [0.0, 1e-12, 1e6])
 def test_light_of_one_value_gives_finite_factors(value: float) -> None:
     seen, points = samples(1000)
-    light = find_light(dataclasses.replace(seen, light=np.full(1000, value)), ShadowSettings())
+    light = find_light(dataclasses.replace(seen, light=np.full(1000, value)))
     assert light is not None
     assert (light.strengths >= 0.0).all()
     dark = light.darkening(seen.normals, free(points, light.directions), 0.15)
@@ -122,14 +122,14 @@ def test_light_of_one_value_gives_finite_factors(value: float) -> None:
 
 
 def test_too_few_samples_are_no_light() -> None:
-    assert find_light(samples(100)[0], ShadowSettings()) is None
+    assert find_light(samples(100)[0]) is None
     seen, _ = samples(1000)
     weightless = dataclasses.replace(seen, weights=np.zeros(1000))
-    assert find_light(weightless, ShadowSettings()) is None
+    assert find_light(weightless) is None
 
 
 def test_it_repeats_exactly(found: CastLight) -> None:
-    again = find_light(samples()[0], ShadowSettings())
+    again = find_light(samples()[0])
     assert again is not None
     np.testing.assert_array_equal(again.directions, found.directions)
     np.testing.assert_array_equal(again.strengths, found.strengths)

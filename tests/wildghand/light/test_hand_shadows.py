@@ -11,15 +11,14 @@ import torch
 import trimesh
 from tiny_fits import UNJUDGED
 
-from hwp_bench.base.errors import BadInput
 from hwp_bench.hands import load_template, pose_hand, vertex_normals
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.avatar.files import load_avatar, save_avatar
 from wildghand.fitting.components import make_fit
-from wildghand.fitting.light import Shadows
+from wildghand.fitting.light import Lighting
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import HandRig, make_rig
-from wildghand.light import CastLight, HandShadows, Obstacles, ShadowSettings, ShadowTable
+from wildghand.light import CastLight, HandShadows, Obstacles, ShadowTable
 from wildghand.light.hand_shadows import LIFT
 from wildghand.model.settings import read_settings
 
@@ -80,7 +79,7 @@ def test_what_is_in_the_way_is_what_rays_meet() -> None:
 
 
 def test_an_open_hand_has_less_shadow_than_a_bent_one(rigs: dict[str, HandRig]) -> None:
-    shadows = HandShadows({"right": rigs["right"]}, a_light(), ShadowSettings(), darkest=0.0)
+    shadows = HandShadows({"right": rigs["right"]}, a_light(), darkest=0.0)
     least = []
     for bend in (0.0, 0.9):
         dark = shadows.of({"right": hand(bend, (0.0, 0.0, 0.4))})["right"]
@@ -93,7 +92,7 @@ def test_an_open_hand_has_less_shadow_than_a_bent_one(rigs: dict[str, HandRig]) 
 
 def test_factors_at_vertices_are_those_of_the_formula(rigs: dict[str, HandRig]) -> None:
     light, darkest = a_light(), 0.15
-    shadows = HandShadows({"right": rigs["right"]}, light, ShadowSettings(), darkest=darkest)
+    shadows = HandShadows({"right": rigs["right"]}, light, darkest=darkest)
     pose = hand(0.9, (0.0, 0.0, 0.4))
     got = shadows.at_vertices({"right": pose})["right"][0]
     template = rigs["right"].template
@@ -114,7 +113,7 @@ def test_factors_at_vertices_are_those_of_the_formula(rigs: dict[str, HandRig]) 
 
 def test_a_hand_in_the_light_of_the_other_shades_it(rigs: dict[str, HandRig]) -> None:
     lamp = CastLight(np.array([[0.0, 0.0, -1.0]], np.float32), np.ones(1, np.float32), 0.25)
-    shadows = HandShadows(rigs, lamp, ShadowSettings(), darkest=0.0)
+    shadows = HandShadows(rigs, lamp, darkest=0.0)
     middles = {side: rig.template.vertices.mean(dim=0) for side, rig in rigs.items()}
     # One is straight in front of the other.
     far = hand(0.0, tuple((torch.tensor([0.0, 0.0, 0.5]) - middles["right"]).tolist()))
@@ -132,21 +131,17 @@ def test_shading_is_the_irradiance_with_nothing_in_the_way(rigs: dict[str, HandR
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     falling = np.maximum(normals @ light.directions.T.astype(float), 0.0) @ light.strengths
     expected = (0.25 + falling) ** (1.0 / 2.2)
-    got = HandShadows(rigs, light, ShadowSettings()).shading(torch.from_numpy(normals).float())
-    assert got is not None
+    got = HandShadows(rigs, light).shading(torch.from_numpy(normals).float())
     np.testing.assert_allclose(got, expected, rtol=1e-5)
-    off = HandShadows(rigs, light, ShadowSettings(shading=False))
-    assert off.shading(torch.zeros(1, 1, 3)) is None
     # In the dark skin is dim and not black.
     dark = CastLight(light.directions, np.zeros(3, np.float32), 0.0)
-    night = HandShadows(rigs, dark, ShadowSettings()).shading(torch.zeros(1, 1, 3))
-    assert night is not None
+    night = HandShadows(rigs, dark).shading(torch.zeros(1, 1, 3))
     assert 0.3 < float(night[0, 0]) < 0.5
 
 
 def test_the_table_of_a_clip_holds_the_same(make_training: TrainingMaker) -> None:
     fit = make_fit(make_training(), read_settings(UNJUDGED), 0, torch.device("cpu"))
-    shadows = HandShadows(fit.model.rigs, a_light(), ShadowSettings())
+    shadows = HandShadows(fit.model.rigs, a_light())
     table = ShadowTable(shadows, fit.clip)
     pose, betas, transl = fit.clip.parameters["right"]
     for rows in ([3], [0, 3, 5], [5, 0]):
@@ -185,7 +180,7 @@ def test_training_frames_are_drawn_with_their_shadows(make_training: TrainingMak
     fit = make_fit(make_training(), read_settings(UNJUDGED), 0, torch.device("cpu"))
     fit.model.keep(a_light())
     rows = torch.tensor([1, 4])
-    table = ShadowTable(HandShadows(fit.model.rigs, a_light(), ShadowSettings()), fit.clip)
+    table = ShadowTable(HandShadows(fit.model.rigs, a_light()), fit.clip)
     size = fit.data.training.width, fit.data.training.height
     # Without factors at hand the model casts them itself.
     own = fit.model.draw_frames(fit.clip, rows, *size)
@@ -198,34 +193,11 @@ def test_training_frames_are_drawn_with_their_shadows(make_training: TrainingMak
 def test_a_fit_finds_a_light_unless_it_is_switched_off(make_training: TrainingMaker) -> None:
     found = make_fit(make_training(), read_settings(UNJUDGED), 0, torch.device("cpu"))
     assert found.model.shadows is not None
-    shadows = found.part(Shadows)
+    shadows = found.part(Lighting)
     assert shadows is not None
     assert set(shadows.dark(torch.tensor([0]))) == {"right"}
     off = read_settings({**UNJUDGED, "shadows.enabled": False})
     without = make_fit(make_training(), off, 0, torch.device("cpu"))
     assert without.model.shadows is None
-    assert without.part(Shadows) is None
+    assert not without.part(Lighting).dark(torch.tensor([0]))
     assert not [name for name, _ in without.model.named_buffers() if name.startswith("shadows_")]
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("shadows_directions", torch.zeros(3, 2)),
-        ("shadows_directions", torch.full((3, 3), 2.0)),
-        ("shadows_strengths", torch.tensor([0.1, -0.1, 0.0])),
-        ("shadows_strengths", torch.zeros(5)),
-        ("shadows_strengths", None),
-        ("shadows_ambient", torch.tensor(float("nan"))),
-    ],
-    ids=str,
-)
-def test_hostile_lights_are_refused_by_name(name: str, value: torch.Tensor | None) -> None:
-    tensors = a_light().to_tensors()
-    if value is None:
-        del tensors[name]
-    else:
-        tensors[name] = value
-    with pytest.raises(BadInput, match=name):
-        CastLight.from_tensors(tensors, "an avatar")
-    assert CastLight.from_tensors({}, "an avatar") is None

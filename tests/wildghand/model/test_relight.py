@@ -9,10 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from wildghand.evidence.count import camera_centres
 from wildghand.gaussians.attributes import RawAttributes
 from wildghand.gaussians.rig import AnchorPoses
 from wildghand.light import KnownLight
-from wildghand.model.frames import camera_centres, carried_on, relit
+from wildghand.model.frames import carried_on, relit
 from wildghand.network import NetworkOutput
 
 COUNT = 40

@@ -36,6 +36,10 @@ TERMS: dict[str, tuple[Callable[..., torch.Tensor], tuple[torch.Tensor, ...]]] =
         (uniform(2, 5, 14) - 0.5,),
     ),
     "distance to one": (terms.distance_to_one, (uniform(7, 2),)),
+    "norm of the distance": (
+        lambda values: terms.distance_to_one(values, squared=False),
+        (uniform(7, 2),),
+    ),
     "silhouette": (
         lambda coverage: terms.silhouette(coverage, TARGET[..., 0] > 0.5),
         (IMAGE[..., :1],),
@@ -70,6 +74,7 @@ def test_values_are_the_definitions() -> None:
         channels.abs().sum(-1).mean().item()
     )
     assert float(terms.distance_to_one(torch.tensor([0.5, 1.0]))) == 0.125
+    assert float(terms.distance_to_one(torch.tensor([0.5, 1.0]), squared=False)) == 0.25
     assert float(terms.silhouette(torch.ones(1, 2, 2), torch.eye(2)[None] > 0)) == 0.5
     assert float(terms.weight_reward(torch.tensor([1.0, 3.0]))) == -2.0
     assert float(terms.cross_hand(torch.zeros(2, 2), torch.eye(2))) == 0.5
@@ -111,12 +116,6 @@ def test_no_weight_no_loss() -> None:
     loss.backward()
     assert float(loss.detach()) == 0.0
     assert (image.grad == 0.0).all()
-
-
-def test_the_papers_weights() -> None:
-    paper = terms.WEIGHTS["published"]
-    assert (paper.bias, paper.shadow, paper.opacity) == (0.1, 0.001, 0.1)
-    assert (paper.laplacian_offsets, paper.weight_reward) == (0.1, 0.5)
 
 
 def test_inexact_poses_leave_at_most_the_lesser_share_to_dssim() -> None:

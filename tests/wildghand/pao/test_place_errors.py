@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
 
-from wildghand.pao.pao import MOST, PLACE_RATE, PaoSettings, PerturbationAwareWeights, PlaceErrors
+from wildghand.pao.pao import MOST, PLACE_RATE, PerturbationAwareWeights, PlaceErrors
 from wildghand.pao.regions import ClipRegions, FrameRegions, stack_regions
 
 CPU = torch.device("cpu")
@@ -107,18 +105,14 @@ def test_batches_of_a_long_clip_know_the_same_places() -> None:
 
 
 def test_regions_count_in_the_ordinary_error_of_their_places() -> None:
-    """Oracle: the weights of `median`, once the error is divided by the expected one."""
-    by_place = PerturbationAwareWeights(PaoSettings(errors="place"))
-    by_median = PerturbationAwareWeights(replace(by_place.settings, errors="median"))
+    """Oracle: errors divided by the expected ones, and by one number for the whole hand."""
+    module = PerturbationAwareWeights()
     error, omega = errors(3, 0.2)[:2], torch.zeros(2)
     regions, hand = stack_regions(REGIONS[:2]), HAND[:2]
     expected = torch.where(torch.from_numpy(LABELS == 3), 0.2, MEDIAN).expand(2, SIZE, SIZE)
-    found = by_place(error, regions, hand, omega, MEDIAN, expected)
+    found = module(error, regions, hand, omega, expected)
     np.testing.assert_allclose(found.errors, 1.0, rtol=1e-5)
-    plain = by_median(error, regions, hand, omega, MEDIAN, expected)
+    plain = module(error, regions, hand, omega, torch.full_like(expected, MEDIAN))
     np.testing.assert_allclose(plain.errors[:, 3], 10.0, rtol=1e-5)
     assert float(plain.weights.detach()[:, 7, 7].max()) == 0.0
     assert float(found.weights.detach()[:, 7, 7].min()) > 0.5
-    # Before anything is known, both are alike.
-    first = by_place(error, regions, hand, omega, MEDIAN, None)
-    assert torch.equal(first.weights, plain.weights)

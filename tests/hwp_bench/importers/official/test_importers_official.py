@@ -32,7 +32,7 @@ from hwp_bench.capture.splits import contiguous_split, split_for
 from hwp_bench.cli.main import main
 from hwp_bench.hands import HandTemplate, load_template, pose_hand
 from hwp_bench.importers.official import OfficialImport, import_official
-from hwp_bench.importers.official.crop import box_of_landmarks, correct_crop, official_crop
+from hwp_bench.importers.official.from_release import box_of_landmarks, correct_crop, official_crop
 from hwp_bench.importers.official.records import find_folders, read_records
 from hwp_bench.importers.shared.output import project_hand
 

@@ -40,8 +40,7 @@ def tracked(image: np.ndarray, swapped: np.ndarray, hidden: np.ndarray, right: n
     def rows(values: np.ndarray) -> np.ndarray:
         return np.where(swapped.reshape(1, -1, *[1] * (values.ndim - 2)), values[::-1], values)
 
-    names = ("image", "world", "score", "right", "track")
-    return HandTracks(*(rows(getattr(made, name)) for name in names), made.size)
+    return HandTracks(*map(rows, made.arrays.values()), made.size)
 
 
 def votes() -> np.ndarray:
@@ -95,15 +94,9 @@ def test_sound_tracks_stay_as_they_are() -> None:
     given_tracks = tracked(truth(crossing=False), nothing[0], nothing, votes())
     found = associate(given_tracks)
     assert (found.swaps, found.doubles) == (0, 0)
-    for name in ("image", "world", "score", "right", "track"):
-        np.testing.assert_array_equal(getattr(found.tracks, name), getattr(given_tracks, name))
-
-
-def test_one_hand_is_returned_as_it_is() -> None:
-    nothing = np.zeros((2, FRAMES), bool)
-    two = tracked(truth(), nothing[0], nothing, votes())
-    names = ("image", "world", "score", "right", "track")
-    one = HandTracks(*(getattr(two, name)[:1] for name in names), two.size)
+    for name, values in given_tracks.arrays.items():
+        np.testing.assert_array_equal(found.tracks.arrays[name], values)
+    one = HandTracks(*(values[:1] for values in given_tracks.arrays.values()), (640, 480))
     assert associate(one).tracks is one
 
 

@@ -146,8 +146,7 @@ def read_patches(path: Path) -> np.ndarray:
     return middles.reshape(-1, 3).astype(np.float64)
 
 
-@pytest.mark.parametrize("full", [False, True])
-@pytest.mark.parametrize("matrix", [1, 6, 9])
+@pytest.mark.parametrize(("matrix", "full"), [(1, False), (6, True), (9, False), (9, True)])
 @pytest.mark.parametrize(
     ("pix_fmt", "bits", "codec", "ending", "tolerance"),
     [

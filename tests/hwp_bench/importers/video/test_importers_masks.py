@@ -118,7 +118,8 @@ def test_without_any_detection_the_silhouette_is_the_mask() -> None:
 
 
 def test_masks_repeat_exactly() -> None:
-    for first, second in zip(masks(pictures()), masks(pictures()), strict=True):
+    few = pictures()[:2]
+    for first, second in zip(masks(few), masks(few), strict=True):
         np.testing.assert_array_equal(first.hand, second.hand)
 
 

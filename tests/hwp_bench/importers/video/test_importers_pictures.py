@@ -24,14 +24,18 @@ from painted_clip import (
 from hwp_bench.hands.raster import draw_faces, mix_corners
 from hwp_bench.importers.video.model import ClipModel, SurfaceMotion, frame_variables, pose_vertices
 from hwp_bench.importers.video.pictures import (
+    Atlas,
     Differences,
+    LitTexture,
     PictureResidual,
+    SeenTexels,
     TextureResidual,
     linearize,
+    sample,
+    smooth_within,
 )
 from hwp_bench.importers.video.residuals import OutlineResidual, signed_distance
 from hwp_bench.importers.video.solve import FittedClip, fit_outline, fit_picture
-from hwp_bench.importers.video.texture import Atlas, LitTexture, SeenTexels, sample, smooth_within
 
 
 def texture_of(fitted: FittedClip) -> TextureResidual:
@@ -103,10 +107,10 @@ def test_a_lit_hand_comes_nearer_to_its_truth_than_by_outline_and_texture() -> N
     before, free = pixel_error(fitted), fitted.model.variables
     held = {name: getattr(free, name).detach().clone() for name in ("betas", "log_depth")}
     done: list[int] = []
-    fit_picture(fitted, picture_of(fitted), done.append)
+    fit_picture(fitted, picture_of(fitted), lambda: done.append(1))
     # 0.75 and 0.61 px when this was written.
     assert pixel_error(fitted) < 0.88 * before
-    assert done == [40, 80, 120]
+    assert len(done) == 120
     for name, value in held.items():
         assert torch.equal(getattr(free, name), value)
 

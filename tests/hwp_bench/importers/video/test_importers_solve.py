@@ -152,23 +152,14 @@ def test_a_left_hand_is_fitted_by_the_left_template() -> None:
     assert reprojection_error(fit(clip, clip.landmarks), clip.landmarks).mean < 0.7
 
 
-def test_the_fit_repeats_exactly() -> None:
-    clip, first = clean_fit()
-    second = fit(clip, clip.landmarks)
+def test_the_fit_repeats_exactly_and_gives_torchs_threads_back() -> None:
+    before = torch.get_num_threads()
+    clip, few = make_clip(6), FitSettings(start_steps=8, landmark_steps=8)
+    footage = Footage(WIDTH, HEIGHT, FPS, FOCAL)
+    first, second = (fit_landmarks(clip.landmarks, clip.template, footage, few) for _ in range(2))
     ours, theirs = (f.model.parameters(clip.landmarks.detected) for f in (first, second))
     np.testing.assert_array_equal(ours.pose, theirs.pose)
     np.testing.assert_array_equal(ours.transl, theirs.transl)
-
-
-def test_the_callers_torch_threads_come_back() -> None:
-    before = torch.get_num_threads()
-    clip = make_clip(4)
-    fit_landmarks(
-        clip.landmarks,
-        clip.template,
-        Footage(WIDTH, HEIGHT, FPS, FOCAL),
-        FitSettings(start_steps=1, landmark_steps=1),
-    )
     assert torch.get_num_threads() == before
 
 

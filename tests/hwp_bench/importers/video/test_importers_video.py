@@ -27,8 +27,7 @@ from hwp_bench.capture.check import check_capture
 from hwp_bench.cli.main import main
 from hwp_bench.hands import load_template, pose_hand, project
 from hwp_bench.hands.raster import overlap
-from hwp_bench.importers.video.api import drop_blank_frames, import_video
-from hwp_bench.importers.video.clip import IMPORTER_VERSION
+from hwp_bench.importers.video.api import IMPORTER_VERSION, drop_blank_frames, import_video
 from hwp_bench.importers.video.decode import FrameRange, probe, read_frames
 from hwp_bench.importers.video.solve import FitSettings
 from hwp_bench.importers.video.source import VideoImport, read_source

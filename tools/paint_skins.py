@@ -1,7 +1,7 @@
-"""Make the space of textures from simulated people: `python -m texture_space_fit.build OUT`.
+"""Make the skins of `baselines/texture-space`: `python -m tools.paint_skins skins.npz`.
 
-Run it with `baselines/texture-space` on the path. It paints the skin of many people with the
-simulator, and keeps mean and principal components of the logarithm of their albedo.
+It paints the skin of many simulated people, and keeps mean and principal components of the
+logarithm of their albedo.
 """
 
 from __future__ import annotations

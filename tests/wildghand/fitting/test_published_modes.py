@@ -1,0 +1,216 @@
+"""The modes `paper` and `released` in a fit.
+
+Oracles: Eq. 7 and 8 and the authors' loss added up by hand (1e-5), the numbers of epochs and
+frames, torch's own optimizer.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from odd_fits import odd_fit, part
+from painted import TrainingMaker
+from tiny_fits import TINY
+
+from hwp_bench.methods.contract import Budget, TrainingCapture
+from wildghand.fitting.fit import Batch, Component, Fit
+from wildghand.fitting.judging import _silhouettes
+from wildghand.fitting.method import affordable
+from wildghand.fitting.objective import Reconstruction, Regularisers, choose_perceptual
+from wildghand.fitting.weights import Pao
+from wildghand.gaussians.regularizers import surface_laplacian
+
+ROWS = torch.tensor([0, 3])
+
+
+def fit_of(training: TrainingCapture, mode: str, **changes: Any) -> Fit:
+    """A fit before its first step, whose biases are large enough to tell them apart."""
+    fit = odd_fit(training, {**TINY, "mode": mode, **changes})
+    for module in fit.model.biases:
+        torch.nn.init.normal_(module.psi.weight, std=0.02)
+    return fit
+
+
+def mean(values: torch.Tensor) -> float:
+    return float(values.double().mean())
+
+
+@pytest.mark.parametrize("mode", ["paper", "released"])
+def test_the_loss_is_the_sum_of_its_terms(mode: str, make_training: TrainingMaker) -> None:
+    fit = fit_of(make_training("both"), mode)
+    batch, released = Batch(ROWS), mode == "released"
+    with torch.no_grad():
+        drawing = fit.draw(batch)
+        target = fit.compare(batch, drawing)
+        weights, image = target.weights, drawing.image
+        visible = fit.data.masks(ROWS) > 0.5
+        whole = fit.data.frames.images[ROWS] / 255.0
+        aim = whole * (visible if released else fit.data.masks(ROWS))[..., None]
+        perceptual = choose_perceptual(fit.settings, fit.device)
+        assert perceptual is not None
+        silhouette = fit.data.silhouettes(ROWS).float()
+        expected: dict[type[Component], dict[str, float]] = {
+            Reconstruction: {
+                "L1": 100.0 * mean(weights[..., None] * (image - aim).abs()),
+                "perceptual": 0.1 * float(perceptual(image, aim, weights)),
+            },
+            Pao: {"weights": -0.5 * mean(weights)},
+            Regularisers: {},
+        }
+        if released:
+            expected[Reconstruction]["silhouette"] = mean(
+                (drawing.coverage[..., 0] - silhouette).square()
+            )
+        for side, hand in drawing.hands.items():
+            raw, module = hand.prediction.raw, fit.model.biases_of(side)
+            temporal = module.temporal(ROWS)
+            biases = module.biases(raw, temporal.z, temporal.omega).concatenate()
+            size = mean(biases.abs().sum(dim=-1))
+            if released:
+                size = mean(module.sum_of_means(raw.concatenate(), temporal.z).square())
+            power = 2.0 if released else 1.0
+            terms = {
+                "bias": 0.1 * size,
+                "shadow": 1e-3 * mean((1.0 - hand.prediction.shadow) ** power),
+                "opacity": 0.1 * mean((1.0 - hand.opacities) ** power),
+            }
+            if released:
+                smooth = surface_laplacian(fit.model.rigs[side])
+                for name, values in (
+                    ("scales", raw.log_scales),
+                    ("colors", raw.logit_colors.sigmoid()),
+                ):
+                    terms[name] = 0.1 * float(smooth.roughness(values))
+            expected[Regularisers] |= {f"{name} {side}": value for name, value in terms.items()}
+        total = float(fit.loss(batch))
+        for kind, sums in expected.items():
+            found = sum(float(t) for t in part(fit, kind).loss(fit, batch, drawing, target))
+            assert found == pytest.approx(sum(sums.values()), rel=1e-5), sums
+            # No term could be left out unseen.
+            assert min(map(abs, sums.values())) > 1e-4 * abs(found), sums
+    assert total == pytest.approx(sum(sum(s.values()) for s in expected.values()), rel=1e-5)
+
+
+@pytest.mark.parametrize("mode", ["paper", "released"])
+def test_the_terms_without_frames_are_the_template_and_the_texture(
+    mode: str, make_training: TrainingMaker
+) -> None:
+    fit = fit_of(make_training("both"), mode)
+    with torch.no_grad():
+        features = {side: fit.model.network.features(side) for side in fit.model.rigs}
+        found = fit._loss_of_features(features)
+        apart = features["left"].texture - features["right"].texture
+        texture = apart.abs() if mode == "paper" else apart.square()
+        rough = [
+            float(surface_laplacian(fit.model.rigs[side]).offsets(hand.template_offsets))
+            for side, hand in features.items()
+        ]
+    assert found is not None
+    assert min(rough) > 1e-6
+    assert float(found) == pytest.approx(0.1 * (sum(rough) + mean(texture)), rel=1e-5)
+
+
+def test_released_compares_with_the_frame_in_front_of_black_and_with_the_posed_mesh(
+    make_training: TrainingMaker,
+) -> None:
+    training = make_training()
+    fit = fit_of(training, "released")
+    # Something covers a part of the hand.
+    masks = fit.data.frames.masks.clone()
+    masks[:, :, masks.shape[2] // 2 :] = 0
+    fit.data.replace_masks(masks)
+    part(fit, Pao).weights.T_b.data.fill_(50.0)
+    drawing = fit.draw(Batch(ROWS))
+    target = fit.compare(Batch(ROWS), drawing)
+    silhouettes = fit.data.silhouettes(ROWS).numpy()
+    posed = np.stack(list(_silhouettes(training, fit.data.frames)))[ROWS.numpy()]
+    assert (silhouettes & posed).sum() > 0.97 * (silhouettes | posed).sum()
+    covered = silhouettes & (masks[ROWS].numpy() < 128)
+    drawn = drawing.coverage[..., 0].detach().numpy() >= 0.95
+    assert (covered & drawn).sum() > 50
+    assert (target.weights.detach().numpy()[covered & drawn] == 0.0).all()
+    assert (target.image.numpy()[masks[ROWS].numpy() < 128] == 0.0).all()
+    # One number a frame where nothing is drawn.
+    outside = (masks[ROWS].numpy() < 128) & ~drawn
+    for weights, place in zip(target.weights.detach().numpy(), outside, strict=True):
+        assert np.ptp(weights[place]) == 0.0
+        assert 0.0 < weights[place][0] < 50.0
+
+
+@pytest.mark.parametrize(
+    ("mode", "hands", "batch"),
+    [("paper", "both", 4), ("released", "right", 1), ("released", "both", 2)],
+)
+def test_a_fit_looks_fifty_times_at_every_frame(
+    mode: str, hands: str, batch: int, make_training: TrainingMaker
+) -> None:
+    training = make_training(hands)
+    fit = fit_of(training, mode)
+    frames = len(fit.data.frames)
+    assert len(next(fit.batches())) == batch
+    assert fit.count_steps(Budget()) == fit.count_steps(Budget(seconds=5.0)) == 50 * frames / batch
+    assert fit.count_steps(Budget(steps=7)) == 7
+    # A budget in seconds leaves no frame out.
+    assert affordable(training, fit.settings, Budget(seconds=1.0)) is training
+
+
+@pytest.mark.parametrize("mode", ["paper", "released"])
+def test_adam_is_torchs_with_its_own_constants(mode: str, make_training: TrainingMaker) -> None:
+    fit = fit_of(make_training(), mode)
+    optimizer = fit.descent.optimizer
+    assert (optimizer.defaults["betas"], optimizer.defaults["eps"]) == ((0.9, 0.999), 1e-8)
+    rates = {len(g["params"]): g["start"] for g in optimizer.param_groups}
+    assert set(rates.values()) <= {1e-4, 1e-6, 0.01, 5e-4, 5e-5}
+    thresholds = next(g for g in optimizer.param_groups if g["start"] == 1e-6)
+    assert len(thresholds["params"]) == 3
+    # All of them are clipped together, as by `clip_grad_norm_(model.parameters(), 1.0)`.
+    assert all(group["clipped"] for group in optimizer.param_groups)
+    theirs = [p.detach().clone().requires_grad_() for p in fit.descent.tensors()]
+    fit.step(next(fit.batches()), 0.0)
+    given = [p for p in zip(fit.descent.tensors(), theirs, strict=True) if p[0].grad is not None]
+    for mine, other in given:
+        other.grad = mine.grad.clone() if mine.grad is not None else None
+    torch.nn.utils.clip_grad_norm_([other for _, other in given], 1.0)
+    for group in optimizer.param_groups:
+        pairs = [other for mine, other in given if any(mine is p for p in group["params"])]
+        if pairs:
+            torch.optim.Adam(pairs, lr=group["start"]).step()
+    assert max(float((a - b).detach().abs().max()) for a, b in given) < 1e-7
+
+
+@pytest.mark.parametrize(
+    ("mode", "moves"), [("released", True), ("paper", False), ("default", False)]
+)
+def test_a_gradient_that_is_not_finite_counts_as_zero_in_released_and_skips_a_step_elsewhere(
+    mode: str, moves: bool, make_training: TrainingMaker
+) -> None:
+    plain = {"prepass.enabled": False, "subject.enabled": False, "shadows.enabled": False}
+    fit = fit_of(make_training(), mode, **plain, **{"schedule.texture_every": 1})
+    spoiled = fit.model.biases[0].phi[2].weight
+    spoiled.register_hook(lambda gradient: torch.full_like(gradient, float("nan")))
+    before = [p.detach().clone() for p in fit.descent.tensors()]
+    place = next(i for i, p in enumerate(fit.descent.tensors()) if p is spoiled)
+    fit.step(next(fit.batches()), 0.0)
+    moved = [not torch.equal(a, b) for a, b in zip(fit.descent.tensors(), before, strict=True)]
+    assert not moved[place]
+    assert any(moved) == moves
+    assert fit.finite()
+
+
+def test_steps_leave_the_geometry_branch_out_by_the_chance_that_is_set(
+    make_training: TrainingMaker,
+) -> None:
+    fit = fit_of(make_training(), "released", **{"schedule.geometry_dropout": 0.5})
+    rows = torch.arange(8)
+    drawing = fit.draw(Batch(rows, stepping=True), kept=None)
+    raw = drawing.hands["right"].prediction.raw.concatenate()
+    network = fit.model.network
+    alone = network.attributes_of_texture("right", network.features("right")).concatenate()
+    plain = [torch.allclose(frame, alone, atol=1e-6) for frame in raw]
+    assert 0 < sum(plain) < 8
+    # The avatar itself, and frames that are looked at, have all of it.
+    looked = fit.draw(Batch(rows)).hands["right"].prediction.raw.concatenate()
+    assert not any(torch.allclose(frame, alone, atol=1e-6) for frame in looked)
