@@ -156,9 +156,9 @@ class Watchers:
         before, self._before = self._before, mean
         return mean > (1.0 - PROGRESS) * before
 
-    def sound(self) -> bool:
-        """Whether the losses since the last window are finite; to be asked when a fit ends."""
-        return all(map(math.isfinite, _read_losses(self._losses)))
+    def sound(self, model: Any) -> bool:
+        """Whether the model and the losses since the last window are finite, when a fit ends."""
+        return all(map(math.isfinite, _read_losses(self._losses))) and model.finite()
 
     def best(self) -> Any:
         """The state with the lowest loss; `DidNotConverge` if there was none."""
@@ -250,7 +250,7 @@ def run_fit(
             if watchers.stands_still(loss):
                 fit.tell(f"The loss has stood still for {fit.plateau_steps} steps; finished early.")
                 break
-        if not watchers.sound():
+        if not watchers.sound(fit):
             step = _go_back(fit, watchers, step)
     return fit.finish(step, report.elapsed)
 

@@ -62,7 +62,7 @@ def test_a_parameter_that_is_no_number_is_divergence(model: PlainModel) -> None:
 
 
 def test_a_model_that_is_broken_since_the_last_window_is_not_sound(model: PlainModel) -> None:
-    guard = Guard()
+    guard = Watchers()
     watch_window(guard, model, 0, 1.0)
     guard.watch(WINDOW, 0.9, model)
     assert guard.sound(model)
