@@ -182,8 +182,6 @@ class Fit(IterativeFit[WildGHandAvatar]):
         self.device = device
         self.world = world
         self.components = components
-        self.plateau_steps = settings.schedule.plateau_steps
-        self.shared_steps = settings.schedule.texture_every
         self.data = FitData(training, device)
         for component in components:
             component.prepare(self)
@@ -201,6 +199,16 @@ class Fit(IterativeFit[WildGHandAvatar]):
         )
         for component in components:
             component.begin(self)
+
+    @property
+    def plateau_steps(self) -> int:
+        """See `IterativeFit`."""
+        return self.settings.schedule.plateau_steps
+
+    @property
+    def shared_steps(self) -> int:
+        """See `IterativeFit`."""
+        return self.settings.schedule.texture_every
 
     @property
     def batch(self) -> int:

@@ -216,8 +216,7 @@ class Recipe(IterativeFit[Avatar], Generic[Settings]):
             return value
         optimizer.clear()
         loss.backward()
-        optimizer.take_step(loss)
-        if optimizer.found_inf:  # a gradient is not finite: the fit has diverged
+        if optimizer.take_step(loss):  # a gradient is not finite: the fit has diverged
             return math.nan
         self.move_back(drawn)
         self._steps += 1
