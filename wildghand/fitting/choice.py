@@ -50,7 +50,7 @@ def choose(
     Args:
         candidates: each with the share by which it must lower the error of the best one before it.
         start: the best one before them, and its error; None: the first of them, at least one.
-        patient: look at all of them; else only until one is no better.
+        patient: look at all of them; else only until one does not improve.
     """
     listed = iter(candidates)
     if start is None:

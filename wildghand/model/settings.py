@@ -28,7 +28,7 @@ WHERE = "wildghand"
 
 @dataclass(frozen=True)
 class SwitchSettings:
-    """An addition whose numbers are constants beside their use."""
+    """An addition whose numbers are constants next to their use."""
 
     #: Whether it is a part of the fit.
     enabled: bool = True

@@ -195,7 +195,7 @@ class Watchers:
 
 
 def _mean_of_window(losses: list[Loss], loss: Loss, window: int) -> float | None:
-    """Add a loss to those of a window; their mean where that is full, which begins anew then."""
+    """Add a loss to those of a window; their mean where that is full; it is emptied then."""
     if not window:
         return None
     losses.append(loss)
