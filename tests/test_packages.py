@@ -1,6 +1,6 @@
-"""Rooms import only what lies below them. Oracle: every import statement of the tree.
+"""Packages import only what lies below them. Oracle: every import statement of the tree.
 
-`docs/architecture.md` states the layers: its lists of rooms are in order, from the lowest to the
+`docs/architecture.md` states the layers: its lists of packages are in order, from the lowest to the
 highest, and this test reads them. It also follows the walks of the page from import to import.
 """
 
@@ -44,14 +44,14 @@ def imports(name: str, path: Path, known: dict[str, Path]) -> Iterator[str]:
 
 
 def layers(package: str) -> list[str]:
-    """The rooms of a package in the order of the page's list, lowest first."""
+    """The parts of a package in the order of the page's list, lowest first."""
     rows = re.findall(rf"^- `{package}/(\w+)`", PAGE.read_text("utf-8"), re.MULTILINE)
     assert len(rows) == len(set(rows))
     return rows
 
 
-def room(name: str) -> str:
-    """The room of a module: `base` of `hwp_bench.base.errors`; `` of a package's `__init__`."""
+def part(name: str) -> str:
+    """The part of a module: `base` of `hwp_bench.base.errors`; `` of a package's `__init__`."""
     return [*name.split("."), ""][1]
 
 
@@ -66,21 +66,21 @@ def every_import() -> dict[str, list[str]]:
 
 @pytest.mark.parametrize("package", PACKAGES)
 def test_the_page_names_every_room(package: str) -> None:
-    there = {room(name) for name in MODULES if name.split(".")[0] == package} - {""}
+    there = {part(name) for name in MODULES if name.split(".")[0] == package} - {""}
     assert set(layers(package)) == there
 
 
 @pytest.mark.parametrize("package", PACKAGES)
-def test_rooms_import_only_what_lies_below(package: str) -> None:
+def test_packages_import_only_what_lies_below(package: str) -> None:
     rank = {name: place for place, name in enumerate(layers(package))}
     wrong = [
         f"{name} imports {target}"
         for name, targets in every_import().items()
         for target in targets
         if name.split(".")[0] == target.split(".")[0] == package
-        and room(name)
-        and room(target)
-        and rank[room(name)] < rank[room(target)]
+        and part(name)
+        and part(target)
+        and rank[part(name)] < rank[part(target)]
     ]
     assert wrong == []
 
@@ -161,9 +161,9 @@ def test_parts_of_a_package_do_not_import_one_another_in_a_circle(parent: str) -
 
 @pytest.mark.parametrize("package", PACKAGES)
 def test_no_public_name_of_a_package_is_also_a_room(package: str) -> None:
-    # Importing a room sets it as an attribute of the package, in place of the public name.
+    # Importing a part sets it as an attribute of the package, in place of the public name.
     public = set(__import__(package).__all__)
-    assert public.isdisjoint(room(name) for name in MODULES if name.split(".")[0] == package)
+    assert public.isdisjoint(part(name) for name in MODULES if name.split(".")[0] == package)
 
 
 #: Most words of the page, and most modules of its walks.
