@@ -19,10 +19,10 @@ from benchmarks.simulation import SPREAD, Kind, frames_of
 from hwp_bench.base.rays import EmbreeMesh, EmbreexMesh, library
 from hwp_bench.metrics.pixels import decibels
 from hwp_bench.sim.effects import hands_at, plan_frame
-from hwp_bench.sim.geometry.rays import RenderCost
+from hwp_bench.sim.geometry.surface import RenderCost
 from hwp_bench.sim.render.frame import carry_out, render_frame
 from hwp_bench.sim.render.stage import Stage
-from hwp_bench.sim.scene.motion import intrinsics, pixel_rays, viewmat
+from hwp_bench.sim.scene.scene import intrinsics, pixel_rays, viewmat
 from hwp_bench.sim.scene_files import load_scene
 from hwp_bench.sim.subject.hand import MOVING
 

@@ -10,7 +10,7 @@ import torch
 
 from hwp_bench.importers.video import VideoImport
 from hwp_bench.importers.video.api import fit_video, read_source
-from hwp_bench.sim.produce.tracker import curl, edge_on
+from hwp_bench.sim.produce.estimates import curl, edge_on
 
 #: Share of the frames with the smallest errors that says how large errors are in easy frames.
 EASY = 0.05

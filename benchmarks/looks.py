@@ -24,14 +24,12 @@ import numpy as np
 
 from hwp_bench.sim.effects import plan_frame
 from hwp_bench.sim.produce.estimates import confused_mask, estimate_mask
-from hwp_bench.sim.props.backdrops import plane_names
-from hwp_bench.sim.props.behind import Behind, Clutter, Face, OtherArm
+from hwp_bench.sim.props.behind import Behind, Clutter, Face, OtherArm, plane_names
 from hwp_bench.sim.render.frame import render_frame
 from hwp_bench.sim.scene.scene import Scene
 from hwp_bench.sim.scene_files import load_scene
 from hwp_bench.sim.subject.arms import arm_atlas
-from hwp_bench.sim.subject.atlas import skin_atlas
-from hwp_bench.sim.subject.skin import of_side
+from hwp_bench.sim.subject.hand import of_side, skin_atlas
 from hwp_bench.sim.subject.subject import Looks
 from hwp_bench.sim.subject.wear import Glove, Polish, Ring, Tattoo, WristWear
 

@@ -21,9 +21,7 @@ import numpy as np
 from hwp_bench.hands import HandTemplate
 from hwp_bench.hands.skeleton import JOINT_COUNT
 from hwp_bench.sim.effects import hands_at
-from hwp_bench.sim.light.lights import focus_point
-from hwp_bench.sim.scene.motion import HandMoment, hand_parameters, scene_hands
-from hwp_bench.sim.scene.scene import Scene
+from hwp_bench.sim.scene.scene import HandMoment, Scene, hand_parameters, scene_hands
 from hwp_bench.sim.subject.hand import MOVING, SubjectHand
 
 #: Way along the skin, m, below which two places of a hand are neighbours.
@@ -147,7 +145,7 @@ def scene_penetration(scene: Scene, moments: Iterable[float]) -> dict[str, np.nd
 
 def _posed(hand: SubjectHand, moment: HandMoment, side: str) -> np.ndarray:
     """The rendered surface at the template's vertices: (T, 3) m."""
-    vertices, _ = hand.pose(*hand_parameters(moment, side, hand.joints, focus_point()))
+    vertices, _ = hand.pose(*hand_parameters(moment, side, hand.joints))
     return vertices[: len(hand.template.vertices)]
 
 

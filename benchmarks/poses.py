@@ -25,7 +25,7 @@ from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.hands import HandParameters
 from hwp_bench.hands.poses import posed_skeleton, rest_skeleton
-from hwp_bench.sim.produce.suites import ensure_suite, suite_names
+from hwp_bench.sim.produce.capture import ensure_suite, suite_names
 from wildghand.poses import believed_hands
 
 #: Colours of the drawn hands, sRGB.

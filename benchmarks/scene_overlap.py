@@ -10,10 +10,10 @@ import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
 
-from hwp_bench.sim.effects import ComplexPoses, ObjectInteraction, read_settings
+from hwp_bench.sim.effects import ComplexPoses, ObjectInteraction, read_effect
 from hwp_bench.sim.hand.rigs import FROM_FILE, SHIPPED
 from hwp_bench.sim.scene.scene import HandKey, Scene
-from hwp_bench.sim.subject.subject import Subject
+from hwp_bench.sim.subject.subject import Subject, without_defaults
 
 #: What a scene is made of, and what of it two sets may not share.
 KINDS = ("subject", "looks", "room", "light", "object", "gestures")
@@ -38,9 +38,9 @@ def parts(scene: Scene) -> set[tuple[str, str]]:
         *(("light", text) for text in _lights(scene)),
     }
     for call in scene.effects:
-        if call.kind == "hand_object_interaction":
-            items = read_settings(ObjectInteraction, call, scene.id).items
-            found |= {("object", item.object) for item in items}
+        effect = read_effect(call, scene.id)
+        if isinstance(effect, ObjectInteraction):
+            found |= {("object", item.object) for item in effect.items}
     for row in _rows(scene):
         found |= {("gestures", json.dumps(asdict(key))) for key in row}
         if len(row) >= _ROW:
@@ -83,7 +83,7 @@ def _identity(subject: Subject, scene_seed: int) -> Iterator[str]:
 
 def _looks(subject: Subject) -> Iterator[str]:
     yield f"tone {subject.tone:g} at {subject.age:g} years"
-    for name, value in subject.looks.to_json().items():
+    for name, value in without_defaults(subject.looks).items():
         for item in value if isinstance(value, (list, tuple)) else ():
             if isinstance(item, dict):
                 item = {key: part for key, part in item.items() if key != "side"}
@@ -107,12 +107,12 @@ def _things(table: dict[str, object]) -> Iterator[tuple[str, str]]:
 def _rows(scene: Scene) -> Iterator[tuple[HandKey, ...]]:
     yield from scene.track.keys.values()
     for call in scene.effects:
-        if call.kind == "complex_poses":
-            poses = read_settings(ComplexPoses, call, scene.id)
-            yield from (row for row in (poses.right, poses.left) if row)
-        if call.kind == "hand_object_interaction":
-            stage = read_settings(ObjectInteraction, call, scene.id).stage
-            yield from ((key,) for key in (stage.right, stage.left) if key is not None)
+        effect = read_effect(call, scene.id)
+        if isinstance(effect, ComplexPoses):
+            yield from (row for row in (effect.right, effect.left) if row)
+        if isinstance(effect, ObjectInteraction):
+            held = (effect.stage.right, effect.stage.left)
+            yield from ((key,) for key in held if key is not None)
 
 
 def _known_again(gestures: list[str]) -> str:

@@ -95,10 +95,10 @@ def plain_scores(frame: Frame) -> dict[str, float]:
 
 def check_agreement(frames: list[Frame]) -> None:
     """Stop where the two loops do not compute the same numbers."""
-    for frame, score in zip(frames, score_frames(frames), strict=True):
+    for frame, scores in zip(frames, score_frames(frames), strict=True):
         for name, value in plain_scores(frame).items():
-            if abs(value - score.values[name]) > 1e-9:
-                raise SystemExit(f"{name}: {score.values[name]} here, {value} by scikit-image")
+            if abs(value - scores[name]) > 1e-9:
+                raise SystemExit(f"{name}: {scores[name]} here, {value} by scikit-image")
 
 
 def timed(work: Callable[[], None]) -> np.ndarray:

@@ -158,8 +158,7 @@ def penetration_table(frames: int) -> str:
     """A Markdown table of the deepest places, over gestures and over frames of the scenes, mm."""
     from benchmarks.penetration import hand_penetration, scene_penetration
     from hwp_bench.hands.poses import gestures
-    from hwp_bench.sim.scene.motion import moment_of_key, scene_hands
-    from hwp_bench.sim.scene.scene import HandKey
+    from hwp_bench.sim.scene.scene import HandKey, moment_of_key, scene_hands
     from hwp_bench.sim.subject.hand import MOVING
 
     hand = scene_hands(load_scene("capture1"), MOVING)["right"]

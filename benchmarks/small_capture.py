@@ -13,7 +13,7 @@ from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.methods.contract import RunSettings, TrainingCapture
 from hwp_bench.methods.request import open_request, write_request
-from hwp_bench.sim.produce.suites import ensure_suite, suite
+from hwp_bench.sim.produce.capture import ensure_suite, suite
 
 #: Frames of the small capture; a benchmark repeats them.
 FRAMES = 24

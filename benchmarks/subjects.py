@@ -19,11 +19,10 @@ import numpy as np
 from benchmarks.rig_files import boxes, capped, remeshed, with_forearm, without_nails, write_rig
 from hwp_bench.base.tables import to_markdown
 from hwp_bench.hands import load_template
-from hwp_bench.sim.hand.off_template import SubjectAnatomy
+from hwp_bench.sim.hand.anatomy import SubjectAnatomy
 from hwp_bench.sim.produce.preview import captioned
 from hwp_bench.sim.produce.truth import subject_table, template_distance
-from hwp_bench.sim.scene.motion import moment_of_key
-from hwp_bench.sim.scene.scene import HandKey, Scene, Track
+from hwp_bench.sim.scene.scene import HandKey, Scene, Track, moment_of_key
 from hwp_bench.sim.scene_files import load_scene
 from hwp_bench.sim.subject.hand import MOVING, subject_hand
 from hwp_bench.sim.subject.subject import Subject
@@ -161,7 +160,7 @@ def main() -> None:
             import cv2
 
             # A quarter of the texels is still finer than the cells, and painted sooner.
-            with mock.patch("hwp_bench.sim.subject.atlas.ATLAS", 512):
+            with mock.patch("hwp_bench.sim.subject.hand.ATLAS", 512):
                 image = picture(scene, people)[..., ::-1]
             cv2.imwrite(str(args.picture), image, [cv2.IMWRITE_JPEG_QUALITY, 88])
 

@@ -21,7 +21,7 @@ from hwp_bench.importers.video import FitSettings, VideoImport
 from hwp_bench.importers.video.api import fit_video
 from hwp_bench.importers.video.source import VideoSource, read_source
 from hwp_bench.sim.produce.capture import render_capture
-from hwp_bench.sim.produce.tracker import curl, edge_on
+from hwp_bench.sim.produce.estimates import curl, edge_on
 from hwp_bench.sim.scene_files import parse_scene
 
 #: Frames, rate and size of a simulated clip.

@@ -11,7 +11,7 @@ memory. Then simulated clips, whose true landmarks get such errors, pass the sam
 its parameters are compared with the true ones. The same poses with the errors of scenes that say
 `[estimator] kind = "tracker"` stand next to it. `--picture FILE` draws that. It takes about ten
 minutes on two cores; FOLDER keeps what was computed. Constants of
-`hwp_bench/sim/produce/tracker.py` and `tracker.py` are those that it prints.
+`hwp_bench/sim/produce/estimates.py` and `tracker.py` are those that it prints.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from hwp_bench.hands import load_template
 from hwp_bench.hands.poses import hand_extent, posed_skeleton, rest_skeleton, turned
 from hwp_bench.hands.skeleton import JOINT_NAMES, HandParameters
 from hwp_bench.importers.shared.landmarks import LANDMARK_NAMES
-from hwp_bench.sim.produce.tracker import GAIN, curl, landmark_noise, parameter_errors
+from hwp_bench.sim.produce.estimates import GAIN, curl, landmark_noise, parameter_errors
 
 #: Distances in time at which errors are correlated, s.
 LAGS = (1 / 30, 1 / 6, 1 / 3, 1 / 2, 1.0)

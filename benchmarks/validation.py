@@ -24,7 +24,7 @@ from hwp_bench.methods import find_method, read_manifest
 from hwp_bench.methods.contract import Avatar, Budget, RunSettings
 from hwp_bench.methods.request import open_request, write_request
 from hwp_bench.run.worker import load_entry, render
-from hwp_bench.sim.produce.suites import ensure_suite, suite
+from hwp_bench.sim.produce.capture import ensure_suite, suite
 
 
 class _Quiet:

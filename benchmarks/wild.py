@@ -20,10 +20,9 @@ from benchmarks.scene_overlap import KINDS, counts, parts, shared
 from hwp_bench.base.files import atomic_write
 from hwp_bench.base.tables import Column, Table, to_markdown
 from hwp_bench.sim.hand.rigs import SHIPPED
+from hwp_bench.sim.produce.capture import ensure_suite
 from hwp_bench.sim.produce.preview import captioned
-from hwp_bench.sim.produce.suites import ensure_suite
-from hwp_bench.sim.scene.motion import level
-from hwp_bench.sim.scene.scene import Scene
+from hwp_bench.sim.scene.scene import Scene, level
 from hwp_bench.sim.scene_files import load_scene, scene_groups, scene_names
 
 #: Frames of a capture in its row, and their edge in pixels.

@@ -33,7 +33,7 @@ from hwp_bench.report.tables import HEADLINE
 from hwp_bench.results import Results, read_all
 from hwp_bench.run.engine import Engine, LocalEngine
 from hwp_bench.run.engine.processes import ParallelEngine
-from hwp_bench.sim.produce.suites import ensure_suite, suite_names
+from hwp_bench.sim.produce.capture import ensure_suite, suite_names
 
 #: A capture, its folder, or the name of a suite; `evaluate` takes one or several.
 Captures: TypeAlias = (

@@ -15,7 +15,7 @@ from hwp_bench.leaderboard.site import board_page, shown_rows
 from hwp_bench.leaderboard.suite_data import read_suite_data
 from hwp_bench.metrics import PROTOCOLS, metric_names
 from hwp_bench.results import FrameResult, Results
-from hwp_bench.sim.produce.suites import suite
+from hwp_bench.sim.produce.capture import suite
 
 #: Scores of the metrics that tests say nothing about.
 OTHER_SCORES = dict.fromkeys(metric_names(), 0.5)

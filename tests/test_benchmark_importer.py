@@ -12,7 +12,7 @@ from benchmarks.tracker_clips import KINDS, scene_text
 from hwp_bench.hands import load_template
 from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.importers.video import FitSettings
-from hwp_bench.sim.hand.off_template import SubjectAnatomy
+from hwp_bench.sim.hand.anatomy import SubjectAnatomy
 from hwp_bench.sim.scene_files import parse_scene
 
 

@@ -12,7 +12,7 @@ import pytest
 
 import wildghand
 from benchmarks.scene_overlap import KINDS, counts, parts, shared
-from hwp_bench.sim.hand.off_template import SubjectAnatomy
+from hwp_bench.sim.hand.anatomy import SubjectAnatomy
 from hwp_bench.sim.light.lights import Lamp
 from hwp_bench.sim.scene.scene import Scene
 from hwp_bench.sim.scene_files import load_scene, scene_groups, scene_names

@@ -16,8 +16,7 @@ from hwp_bench.hands import SurfaceAnchors, anchor_uv, load_template
 from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.methods.contract import Budget, RunSettings, TrainingCapture
 from hwp_bench.methods.request import open_request, write_request
-from hwp_bench.sim.subject.atlas import painted_atlas
-from hwp_bench.sim.subject.hand import subject_hand
+from hwp_bench.sim.subject.hand import painted_atlas, subject_hand
 from hwp_bench.sim.subject.subject import Subject
 from wildghand.network.surface import PlaneSampler
 from wildghand.plain.model import PlainAvatar, make_model

@@ -15,8 +15,7 @@ import numpy as np
 
 from hwp_bench.base.console import track
 from hwp_bench.base.files import atomic_write
-from hwp_bench.sim.subject.atlas import painted_atlas
-from hwp_bench.sim.subject.hand import subject_hand
+from hwp_bench.sim.subject.hand import painted_atlas, subject_hand
 from hwp_bench.sim.subject.subject import Looks, Subject
 
 #: People, and the number of the first one; no scene that ships has one of these.

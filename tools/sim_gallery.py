@@ -16,16 +16,26 @@ from hwp_bench.base.arrays import evenly
 from hwp_bench.base.console import track
 from hwp_bench.base.errors import HwpError
 from hwp_bench.base.files import atomic_write, check_places
-from hwp_bench.sim.effects import hands_at, registered
+from hwp_bench.sim.effects import EFFECTS, hands_at
 from hwp_bench.sim.geometry.noise import generator
-from hwp_bench.sim.geometry.rays import RenderCost
-from hwp_bench.sim.light.lights import Lamp, Light, Room, focus_point
+from hwp_bench.sim.geometry.surface import RenderCost
+from hwp_bench.sim.light.lights import Lamp, Light, Room
 from hwp_bench.sim.produce.free_view import FRAMES, free_views, render_free
 from hwp_bench.sim.produce.preview import captioned, strip
 from hwp_bench.sim.props.behind import Behind, Clutter, Face, OtherArm
 from hwp_bench.sim.render.frame import SimulatedFrame, render_frame, steady_gain
-from hwp_bench.sim.scene.motion import hand_parameters, intrinsics, scene_hands, viewmat
-from hwp_bench.sim.scene.scene import EffectCall, HandKey, Scene, Track, with_effects, with_severity
+from hwp_bench.sim.scene.scene import (
+    EffectCall,
+    HandKey,
+    Scene,
+    Track,
+    hand_parameters,
+    intrinsics,
+    scene_hands,
+    viewmat,
+    with_effects,
+    with_severity,
+)
 from hwp_bench.sim.scene_files import load_scene, scene_names
 from hwp_bench.sim.sensor import AutoControl, Sensor, check_encoder, through_h264
 from hwp_bench.sim.subject.subject import Looks
@@ -311,12 +321,12 @@ def _with_estimate(scene: Scene, call: EffectCall, result: SimulatedFrame) -> Si
     from hwp_bench.hands import pose_hand, project
 
     seconds = result.plan.seconds
-    angle, length = registered(call.kind).estimate_error(result.plan.strength[call.kind])
+    angle, length = EFFECTS[call.kind].estimate_error(result.plan.strength[call.kind])
     rng = generator(scene.seed, "gallery")
     image = result.rgb.copy()
     for side, moment in hands_at(scene, seconds).items():
         hand = scene_hands(scene)[side]
-        pose, transl = hand_parameters(moment, side, hand.joints, focus_point())
+        pose, transl = hand_parameters(moment, side, hand.joints)
         pose = pose + angle * rng.normal(size=pose.shape)
         transl = transl + length * rng.normal(size=3)
         arrays = (pose[None], hand.betas, transl[None])

@@ -70,8 +70,17 @@ def bootstrap_mean(
     Args:
         samples: one (S, F) float array a capture: the difference for each seed and frame.
     """
-    blocks = [_checked(sample) for sample in samples]
-    share = _shares(weights, len(blocks))
+    blocks = []
+    for sample in samples:
+        array = np.asarray(sample, dtype=np.float64)
+        if array.ndim != 2 or not array.size or not np.isfinite(array).all():
+            raise UsageError("a sample must be a finite (seeds, frames) array with frames in it")
+        blocks.append(make_blocks(array))
+    share = np.ones(len(blocks)) if weights is None else np.asarray(weights, dtype=np.float64)
+    sound = share.shape == (len(blocks),) and (np.isfinite(share) & (share > 0)).all()
+    if not blocks or not sound:
+        raise UsageError("there must be a capture, and each needs a weight above 0")
+    share = share / share.sum()
     values = np.array([block.value for block in blocks])
     value = float(share @ values)
     random = np.random.default_rng(seed)
@@ -84,20 +93,6 @@ def bootstrap_mean(
         draws = _draws(blocks, share, values, resamples, random)
         skew = skewness_of_mean(values, share)
     return _read(value, float(draws.std()), freedom, skew, len(blocks))
-
-
-def _checked(sample: np.ndarray) -> Blocks:
-    array = np.asarray(sample, dtype=np.float64)
-    if array.ndim != 2 or not array.size or not np.isfinite(array).all():
-        raise UsageError("a sample must be a finite (seeds, frames) array with frames in it")
-    return make_blocks(array)
-
-
-def _shares(weights: Sequence[float] | None, count: int) -> np.ndarray:
-    share = np.ones(count) if weights is None else np.asarray(weights, dtype=np.float64)
-    if not count or share.shape != (count,) or not (np.isfinite(share) & (share > 0)).all():
-        raise UsageError("there must be a capture, and each needs a weight above 0")
-    return share / share.sum()
 
 
 def _draws(
@@ -182,16 +177,11 @@ class Blocks:
         return min(units) - 1
 
     def errors(self, draws: int, random: np.random.Generator) -> np.ndarray:
-        """Draw resampled means minus `value`, spread as `variance` says.
+        """Draw (draws,) resampled means minus `value`, spread as `variance` says.
 
-        Args:
-            draws: how many.
-            random: where from.
-
-        Returns:
-            (draws,) float. Blocks are drawn with replacement; so are seeds, independently of the
-            blocks, because every seed is scored on the same frames. Drawing from few loses part
-            of the variance, which is put back.
+        Blocks are drawn with replacement; so are seeds, independently of the blocks, because
+        every seed is scored on the same frames. Drawing from few loses part of the variance,
+        which is put back.
         """
         starts = random.integers(0, self.means.shape[1], (draws, self.count))
         errors = _restored(self.count) * (self.means.mean(axis=0)[starts].mean(axis=1) - self.value)
@@ -208,11 +198,7 @@ def _restored(count: int) -> float:
 
 
 def make_blocks(values: np.ndarray) -> Blocks:
-    """Return the blocks of one capture.
-
-    Args:
-        values: (S, F) float, one row a seed, frames in order.
-    """
+    """Return the blocks of one capture: (S, F) float, one row a seed, frames in order."""
     frames = values.shape[1]
     length = max(1, round(frames**0.5))
     around = np.concatenate([values, values[:, : length - 1]], axis=1)
@@ -221,12 +207,7 @@ def make_blocks(values: np.ndarray) -> Blocks:
 
 
 def skewness_of_mean(values: np.ndarray, share: np.ndarray) -> float:
-    """Return the estimated skewness of a weighted mean over captures.
-
-    Args:
-        values: (N,) float, the captures' means.
-        share: (N,) float, their weights, adding up to 1.
-    """
+    """Return the estimated skewness of a weighted mean of (N,) captures; weights add up to 1."""
     deviations = values - share @ values
     spread = share @ deviations**2
     # Differences that differ only by rounding have no shape.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import combinations
+from string import ascii_lowercase
 from typing import Any, TypeVar
 
 import numpy as np
@@ -125,11 +126,16 @@ def contrasts(
             for capture in weights
         ]
         estimate = bootstrap_mean(samples, list(weights.values()), resamples=resamples, seed=seed)
-        better = estimate.above
-        if better is not None and not metric_facts(metric).higher_is_better:
-            better = 1 - better
+        better = _surely(estimate, metric)
         found.append(Contrast(metric=metric, scope=scope, estimate=estimate, better=better))
     return _adjusted(found, lambda scope: scope in PERTURBATIONS)
+
+
+def _surely(estimate: Estimate, metric: str) -> float | None:
+    """Return the probability that the first method is better, in the metric's own direction."""
+    if estimate.above is None or metric_facts(metric).higher_is_better:
+        return estimate.above
+    return 1 - estimate.above
 
 
 def _adjusted(found: Sequence[_Contrast], in_family: Callable[[str], bool]) -> list[_Contrast]:
@@ -143,10 +149,10 @@ def standings(
     runs: Sequence[MethodRuns], metric: str, differences: Sequence[Difference]
 ) -> list[Standing]:
     """Return the methods, best first, with their tie groups."""
-    higher = metric_facts(metric).higher_is_better
-    means = {run.label: macro_by_seed(run, metric) for run in runs}
-    order = sorted(runs, key=lambda run: float(means[run.label].mean()) * (-1 if higher else 1))
-    places = {run.label: place for place, run in enumerate(order)}
+    sign = -1 if metric_facts(metric).higher_is_better else 1
+    means = [(run, macro_by_seed(run, metric)) for run in runs]
+    means.sort(key=lambda pair: sign * float(pair[1].mean()))
+    places = {run.label: place for place, (run, _) in enumerate(means)}
     different = {}
     for item in differences:
         if item.scope == MACRO and item.metric == metric:
@@ -155,12 +161,12 @@ def standings(
     return [
         Standing(
             run.label,
-            float(means[run.label].mean()),
-            float(means[run.label].std(ddof=1)) if len(run.seeds) > 1 else None,
-            len(run.seeds),
+            float(mean.mean()),
+            float(mean.std(ddof=1)) if len(mean) > 1 else None,
+            len(mean),
             ties,
         )
-        for run, ties in zip(order, tie_groups(len(order), different), strict=True)
+        for (run, mean), ties in zip(means, tie_groups(len(means), different), strict=True)
     ]
 
 
@@ -192,13 +198,12 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
     Source: Holm, A simple sequentially rejective multiple test procedure, 1979.
     """
-    order = sorted(range(len(p_values)), key=lambda index: p_values[index])
-    adjusted = [1.0] * len(p_values)
-    running = 0.0
-    for rank, index in enumerate(order):
-        running = max(running, min(1.0, (len(p_values) - rank) * p_values[index]))
-        adjusted[index] = running
-    return adjusted
+    values = np.asarray(p_values, dtype=np.float64)
+    order = np.argsort(values, kind="stable")
+    factors = len(values) - np.arange(len(values))
+    adjusted = np.empty(len(values))
+    adjusted[order] = np.maximum.accumulate(np.minimum(1.0, factors * values[order]))
+    return [float(value) for value in adjusted]
 
 
 def tie_groups(count: int, different: Mapping[tuple[int, int], bool]) -> list[str]:
@@ -229,15 +234,10 @@ def tie_groups(count: int, different: Mapping[tuple[int, int], bool]) -> list[st
             )
         ]
     groups.sort(key=sorted)
-    return [
-        "".join(_letter(place) for place, group in enumerate(groups) if item in group)
-        for item in range(count)
-    ]
-
-
-def _letter(place: int) -> str:
-    """Return `a` to `z`, then `a1`, `b1`, ..."""
-    return chr(ord("a") + place % 26) + (str(place // 26) if place >= 26 else "")
+    # `a` to `z`, then `a1`, `b1`, ...
+    letters = [f"{ascii_lowercase[place % 26]}{place // 26 or ''}" for place in range(len(groups))]
+    named = list(zip(letters, groups, strict=True))
+    return ["".join(letter for letter, group in named if item in group) for item in range(count)]
 
 
 @dataclass(frozen=True)
@@ -288,27 +288,27 @@ def rank_methods(
     """
     differences = compare(runs, metric, resamples=resamples, seed=seed, scope=MACRO)
     order = standings(runs, metric, differences)
-    higher = metric_facts(metric).higher_is_better
-    # (first, second) -> first less second, in both directions of a pair.
-    signs = {}
-    leads = {}
+    direction = 1 if metric_facts(metric).higher_is_better else -1
+    # (first, second) -> first less second, and whether the first is significantly better (1) or
+    # worse (-1), in both directions of a pair.
+    leads: dict[tuple[str, str], Estimate] = {}
+    signs: dict[tuple[str, str], int] = {}
     for item in differences:
-        value = item.estimate.value if higher else -item.estimate.value
-        differs = _differs(item, len(runs))
-        signs[item.first, item.second] = (value > 0) - (value < 0) if differs else 0
-        signs[item.second, item.first] = -signs[item.first, item.second]
-        leads[item.first, item.second] = item.estimate
-        leads[item.second, item.first] = turned(item.estimate)
-    means = [place.mean if higher else -place.mean for place in order]
+        sign = direction * int(np.sign(item.estimate.value)) if _differs(item, len(runs)) else 0
+        for pair, lead, turn in (
+            ((item.first, item.second), item.estimate, sign),
+            ((item.second, item.first), turned(item.estimate), -sign),
+        ):
+            leads[pair], signs[pair] = lead, turn
     ranks = []
-    for own, mean in zip(order, means, strict=True):
-        others = [other.label for other in order if other is not own]
+    for own in order:
+        against = [signs[own.label, other.label] for other in order if other is not own]
         ranks.append(
             Rank(
                 own,
-                1 + sum(other > mean for other in means),
-                1 + sum(signs[other, own.label] > 0 for other in others),
-                len(order) - sum(signs[own.label, other] > 0 for other in others),
+                1 + sum(direction * other.mean > direction * own.mean for other in order),
+                1 + against.count(-1),
+                len(order) - against.count(1),
                 leads[own.label, order[0].label] if own is not order[0] else None,
             )
         )
@@ -322,14 +322,12 @@ def _differs(item: Difference, methods: int) -> bool:
 
 def turned(estimate: Estimate) -> Estimate:
     """Return the estimate of second less first."""
-    return Estimate(
-        -estimate.value,
-        None if estimate.high is None else -estimate.high,
-        None if estimate.low is None else -estimate.low,
-        None if estimate.above is None else 1 - estimate.above,
-        estimate.p,
-        estimate.detectable,
-        estimate.captures,
+    return replace(
+        estimate,
+        value=-estimate.value,
+        low=None if estimate.high is None else -estimate.high,
+        high=None if estimate.low is None else -estimate.low,
+        above=None if estimate.above is None else 1 - estimate.above,
     )
 
 
@@ -351,37 +349,33 @@ def verdict(ranking: Ranking) -> str:
     text = f"{lead.value:+.{facts.digits}f}{unit} against {second.standing.label}, the next"
     if lead.low is not None and lead.high is not None:
         ends = f"{lead.low:+.{facts.digits}f} to {lead.high:+.{facts.digits}f}"
-        surely = lead.above
-        if surely is not None and not facts.higher_is_better:
-            surely = 1 - surely
+        surely = _surely(lead, ranking.metric)
         text += f" (95 % interval {ends}"
         text += f", P(better) {surely:.3f})" if surely is not None else ")"
     if first.standing.seeds != second.standing.seeds:
         text += " over the seeds that both have"
     if lead.captures == 1:
         text += ", on one capture, which speaks of no other"
-    tied = _tied_with(first.standing.label, ranking)
     if first.worst == 1:
         return f"{first.standing.label} wins with {mean} (macro mean): {text}."
     if lead.low is None:
         return (
             f"{first.standing.label} leads with {mean} (macro mean): {text}; nothing says how sure."
         )
+    label = first.standing.label
+    told_apart = {
+        name
+        for item in ranking.differences
+        if _differs(item, len(ranking.ranks))
+        for name in (item.first, item.second)
+        if label in (item.first, item.second)
+    }
+    tied = [item.standing.label for item in rest if item.standing.label not in told_apart]
     return (
-        f"No clear winner: {first.standing.label} leads with {mean} (macro mean), {text}, and "
+        f"No clear winner: {label} leads with {mean} (macro mean), {text}, and "
         f"is tied with {', '.join(tied)} (not significantly different"
         + (f", Bonferroni over the {len(rest)} pairs of the leader)." if rest[1:] else ").")
     )
-
-
-def _tied_with(label: str, ranking: Ranking) -> list[str]:
-    """Return the methods that one cannot be told from, best first."""
-    found = {
-        item.second if item.first == label else item.first
-        for item in ranking.differences
-        if label in (item.first, item.second) and not _differs(item, len(ranking.ranks))
-    }
-    return [item.standing.label for item in ranking.ranks if item.standing.label in found]
 
 
 _INTERVAL = (
@@ -478,14 +472,11 @@ class Comparison:
 
     def tables(self) -> list[Table]:
         """Return two tables for each metric: the methods, and their differences."""
-        return [
-            table
+        made = (
+            (standings_table(name, found.methods), differences_table(name, found.differences))
             for name, found in self.metrics.items()
-            for table in (
-                standings_table(name, found.methods),
-                differences_table(name, found.differences),
-            )
-        ]
+        )
+        return [table for pair in made for table in pair]
 
     def as_dict(self) -> dict[str, Any]:
         """Return all numbers by metric, as JSON holds them."""

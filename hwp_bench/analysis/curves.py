@@ -32,14 +32,9 @@ class Curve:
         return float(self.scores[-1])
 
     def at(self, seconds: float | np.ndarray) -> np.ndarray:
-        """Return the score after some time.
+        """Return the scores after some times, s, in their shape.
 
-        Args:
-            seconds: when, s; any shape.
-
-        Returns:
-            The scores, in the same shape: NaN before the first checkpoint; after the end that of
-            the finished fit, which one then has.
+        NaN before the first checkpoint; after the end that of the finished fit, which one has.
         """
         moments = np.asarray(seconds, dtype=np.float64)
         values = np.interp(np.log(moments), np.log(self.seconds), self.scores)
@@ -89,14 +84,6 @@ def curve_of(result: CaptureResult, metric: str) -> Curve | None:
     return Curve(seconds[last], scores[last])
 
 
-def mean_at(curves: Sequence[Curve], seconds: np.ndarray) -> np.ndarray:
-    """Return the mean score of several fits at some moments, (T,) float.
-
-    NaN until every fit has had its first checkpoint.
-    """
-    return np.mean([curve.at(seconds) for curve in curves], axis=0)
-
-
 @dataclass(frozen=True, eq=False)
 class MeanCurve:
     """The mean curve of one method over captures, with a 95 % interval."""
@@ -141,7 +128,7 @@ def mean_curve(label: str, curves: Mapping[str, Sequence[Curve]]) -> MeanCurve |
     between = corners[(corners > start) & (corners < stop)]
     moments = np.unique(np.concatenate([np.geomspace(start, stop, 60), between, [start, stop]]))
     moments = moments[(moments >= start) & (moments <= stop)]
-    rows = np.stack([mean_at(fits, moments) for fits in curves.values()])
+    rows = np.stack([np.mean([c.at(moments) for c in fits], axis=0) for fits in curves.values()])
     mean = rows.mean(axis=0)
     if len(rows) < 2:
         return MeanCurve(label, moments, mean, None, None)

@@ -9,7 +9,7 @@ import numpy as np
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import sha256_json
-from hwp_bench.results import CaptureResult, Results
+from hwp_bench.results import Results
 from hwp_bench.results.schema import differing_makers, differing_settings
 from hwp_bench.taxonomy import PERTURBATIONS
 
@@ -33,14 +33,11 @@ class MethodRuns:
 
     def values(self, capture: str, metric: str, seeds: Sequence[int]) -> np.ndarray:
         """Return the scores of one capture: (S, F) float, frames in the split's order."""
-        rows = [[f.scores for f in _capture(self.seeds[seed], capture).frames] for seed in seeds]
+        chosen = [next(c for c in self.seeds[s].captures if c.id == capture) for s in seeds]
+        rows = [[frame.scores for frame in one.frames] for one in chosen]
         if any(metric not in scores for row in rows for scores in row):
             raise UsageError(f"has frames without {metric}", where=self.label, field=capture)
         return np.array([[scores[metric] for scores in row] for row in rows])
-
-
-def _capture(results: Results, identifier: str) -> CaptureResult:
-    return next(capture for capture in results.captures if capture.id == identifier)
 
 
 def same_but_seed(result: Results) -> str:
@@ -67,45 +64,41 @@ def group_runs(results: Sequence[Results]) -> list[MethodRuns]:
             )
         seeds[result.seed] = result
     runs = list(groups.values())
-    return [
-        MethodRuns(label, seeds)
-        for label, seeds in zip(_labels([next(iter(r.values())) for r in runs]), runs, strict=True)
-    ]
+    firsts = [next(iter(seeds.values())) for seeds in runs]
+    return [MethodRuns(label, own) for label, own in zip(_labels(firsts), runs, strict=True)]
 
 
 def _labels(results: Sequence[Results]) -> list[str]:
     """Return titles, followed by what differs, or led by a number where nothing readable does."""
-    titles = [result.method.title for result in results]
-    states = [_state(result) for result in results]
     differences = differing_settings(results)
+    states = [_state(result) for result in results]
     digests = [result.method.digest[:8] for result in results]
-    for tellings in (
-        [],
-        [differences],
-        [states],
-        [states, differences],
-        [states, differences, digests],
+    empty = [""] * len(results)
+    labels: list[str] = []
+    for told in (
+        (empty,),
+        (differences,),
+        (states,),
+        (states, differences),
+        (states, differences, digests),
     ):
-        labels = [_label(title, *parts) for title, *parts in zip(titles, *tellings, strict=True)]
+        parts = [", ".join(filter(None, own)) for own in zip(*told, strict=True)]
+        titles = [result.method.title for result in results]
+        labels = [f"{t} ({own})" if own else t for t, own in zip(titles, parts, strict=True)]
         if len(set(labels)) == len(labels):
             return labels
     return [f"{index + 1}: {label}" for index, label in enumerate(labels)]
 
 
-def _label(title: str, *parts: str) -> str:
-    told = ", ".join(part for part in parts if part)
-    return f"{title} ({told})" if told else title
-
-
 def _state(result: Results) -> str:
-    parts = [result.method.preset]
-    if result.frames != "perturbed":
-        parts.append(f"{result.frames} frames")
-    if result.budget.get("seconds"):
-        parts.append(f"{result.budget['seconds']:g} s")
-    if result.budget.get("steps"):
-        parts.append(f"{result.budget['steps']} steps")
-    return ", ".join(parts)
+    seconds, steps = result.budget.get("seconds"), result.budget.get("steps")
+    parts = [
+        result.method.preset,
+        f"{result.frames} frames" if result.frames != "perturbed" else "",
+        f"{seconds:g} s" if seconds else "",
+        f"{steps} steps" if steps else "",
+    ]
+    return ", ".join(filter(None, parts))
 
 
 def refuse_unlike(runs: Sequence[MethodRuns]) -> None:
@@ -181,21 +174,20 @@ def common_seeds(first: MethodRuns, second: MethodRuns) -> list[int]:
 def scopes(results: Results) -> dict[str, dict[str, float]]:
     """Return the sets of captures that are averaged, with the weight of each capture."""
     captures = results.captures
+    ones = {capture.id: 1.0 for capture in captures}
     carriers = {
-        name: [capture.id for capture in captures if name in capture.perturbations]
-        for name in PERTURBATIONS
+        name: {c.id: 1.0 for c in captures if name in c.perturbations} for name in PERTURBATIONS
     }
-    carriers = {name: identifiers for name, identifiers in carriers.items() if identifiers}
     macro: dict[str, float] = {}
-    for identifiers in carriers.values():
-        for identifier in identifiers:
-            macro[identifier] = macro.get(identifier, 0.0) + 1 / len(identifiers)
+    for own in carriers.values():
+        for identifier in own:
+            macro[identifier] = macro.get(identifier, 0.0) + 1 / len(own)
     found = {
-        MACRO: macro or {capture.id: 1.0 for capture in captures},
-        "single": {capture.id: 1.0 for capture in captures if capture.hands != "both"},
-        "interacting": {capture.id: 1.0 for capture in captures if capture.hands == "both"},
+        MACRO: macro or ones,
+        "single": {c.id: 1.0 for c in captures if c.hands != "both"},
+        "interacting": {c.id: 1.0 for c in captures if c.hands == "both"},
+        **carriers,
     }
-    found |= {name: dict.fromkeys(identifiers, 1.0) for name, identifiers in carriers.items()}
     return {name: weights for name, weights in found.items() if weights}
 
 

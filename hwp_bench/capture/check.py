@@ -350,33 +350,24 @@ def contact_sheet(capture: Capture, *, count: int = 24, edge: int = 256) -> np.n
         (H, W, 3) uint8. Green outline: the mask that methods are given; coloured skeleton: the
         estimated hand (orange right, blue left), left out where it is not valid.
     """
-    chosen = evenly(len(capture), count).tolist()
-    tiles = [
-        labelled(
-            fitted(draw_hands(outlined(capture.frame(f), capture.mask(f)), points), edge),
-            _caption(capture, f),
-        )
-        for f, points in zip(chosen, project_landmarks(capture, chosen), strict=True)
-    ]
-    return sheet(tiles, columns=6)
-
-
-def project_landmarks(capture: Capture, frames: list[int]) -> Iterator[dict[str, np.ndarray]]:
-    """Yield, for each frame, the projected landmarks (21, 2) px of every valid hand, by side."""
     import torch
 
     from hwp_bench.hands import load_template, project
     from hwp_bench.hands.skinning import pose_parameters
 
-    Ks = torch.from_numpy(capture.cameras.Ks[frames])
-    viewmats = torch.from_numpy(capture.cameras.viewmats[frames])
+    chosen = evenly(len(capture), count).tolist()
+    cameras = (capture.cameras.viewmats[chosen], capture.cameras.Ks[chosen])
     pixels: dict[str, np.ndarray] = {}
     for side, hand in capture.hands.items():
         template = load_template(capture.info.hand_model.source, side)
-        posed = pose_parameters(template, hand, frames)
-        pixels[side] = project(posed.landmarks, viewmats, Ks)[0].numpy()
-    for row, frame in enumerate(frames):
-        yield {s: places[row] for s, places in pixels.items() if capture.hands[s].valid[frame]}
+        landmarks = pose_parameters(template, hand, chosen).landmarks
+        pixels[side] = project(landmarks, *map(torch.from_numpy, cameras))[0].numpy()
+    tiles = []
+    for row, frame in enumerate(chosen):
+        seen = {s: places[row] for s, places in pixels.items() if capture.hands[s].valid[frame]}
+        drawn = draw_hands(outlined(capture.frame(frame), capture.mask(frame)), seen)
+        tiles.append(labelled(fitted(drawn, edge), _caption(capture, frame)))
+    return sheet(tiles, columns=6)
 
 
 def draw_hands(image: np.ndarray, points: dict[str, np.ndarray]) -> np.ndarray:

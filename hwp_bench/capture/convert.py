@@ -68,15 +68,9 @@ def with_one_shape(
 ) -> tuple[HandParameters, np.ndarray]:
     """Give all frames the median shape, and move each so that its vertices stay in place.
 
-    Args:
-        pose: (F, 16, 3) axis-angle rad, the pose itself (no mean pose to be added).
-        betas: (F, 10), one for each frame, as per-frame estimators give them.
-        transl: (F, 3) m.
-        valid: (F,) bool.
-
-    Returns:
-        Parameters with one shape, and (F,) the mean distance of the vertices from where the
-        frame's own shape has them, mm; NaN where not valid.
+    The pose is the pose itself (no mean pose to be added); betas (F, 10) are one for each frame, as
+    per-frame estimators give them. Returned too are (F,) the mean distances of the vertices from
+    where the frame's own shape has them, mm; NaN where not valid.
     """
     if betas.shape != (len(pose), 10):
         raise ShapeMismatch(f"shape is {betas.shape}, expected ({len(pose)}, 10)", field="betas")

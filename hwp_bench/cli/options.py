@@ -100,7 +100,7 @@ def captures_of(places: Sequence[str] | None, file: Path) -> list[Path]:
     from hwp_bench.evaluation.verify import capture_folders
     from hwp_bench.results import read_results
     from hwp_bench.sim import ensure_suite
-    from hwp_bench.sim.produce.suites import suite_names
+    from hwp_bench.sim.produce.capture import suite_names
 
     if places:
         folders = capture_folders([Path(place) for place in places])

@@ -18,8 +18,7 @@ from msgspec import Meta
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.files import canonical_json, read_json, write_json
 from hwp_bench.base.records import MAX_SEED, Digest, Line, Record, parse_record, without_schema
-from hwp_bench.sim.produce.capture import RENDERER
-from hwp_bench.sim.produce.suites import SuiteItem, suite
+from hwp_bench.sim.produce.capture import RENDERER, SuiteItem, suite
 from hwp_bench.sim.scene.scene import Scene, with_subject
 from hwp_bench.sim.scene_files import known_scenes, load_scene
 

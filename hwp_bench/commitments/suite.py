@@ -42,7 +42,7 @@ from hwp_bench.commitments.recipe import (
 )
 from hwp_bench.methods.request import open_request
 from hwp_bench.run.engine import Engine, Needs
-from hwp_bench.sim.produce.suites import ensure_suite
+from hwp_bench.sim.produce.capture import ensure_suite
 
 #: Version of the public page.
 SUITE_SCHEMA = "hwp-sealed-suite/1"

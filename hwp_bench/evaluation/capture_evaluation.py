@@ -27,9 +27,9 @@ from hwp_bench.evaluation.scoring import (
     read_targets,
     score_frames_of,
 )
-from hwp_bench.methods.contents import digest_of, exposed_digest, left_out_folders, method_files
+from hwp_bench.methods.contents import digest_of, exposed_digest, method_files
 from hwp_bench.methods.contract import FRAME_CHOICES, RunSettings
-from hwp_bench.methods.manifest import MethodManifest, read_manifest, ships
+from hwp_bench.methods.manifest import MethodManifest, read_manifest
 from hwp_bench.methods.request import write_request
 from hwp_bench.metrics import METRICS, PROTOCOLS
 from hwp_bench.metrics.lpips import load_available
@@ -218,17 +218,11 @@ def _run(
 
 
 def _confinement(evaluation: CaptureEvaluation, output: Path) -> Confinement:
-    """Hide what holds test frames, the capture and results next to the run, and undigested code."""
+    """Hide what holds test frames: the capture, and results next to the run."""
     asked = evaluation.confinement
     hands = hand_model_files(evaluation.capture.info.hand_model.source)
-    root = evaluation.manifest.root.resolve()
-    # What is in no digest must decide no score. Shipped methods keep their compiled modules.
-    odd = [] if ships(root) else left_out_folders(root)
-    return replace(
-        asked,
-        exposed=(*asked.exposed, *hands),
-        hidden=(*asked.hidden, *odd, evaluation.capture.root, output.parent.parent),
-    )
+    hidden = (*asked.hidden, evaluation.capture.root, output.parent.parent)
+    return replace(asked, exposed=(*asked.exposed, *hands), hidden=hidden)
 
 
 def _curve(evaluation: CaptureEvaluation, output: Path, facts: RunFacts) -> list[CurvePoint]:

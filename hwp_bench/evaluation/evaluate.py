@@ -47,7 +47,7 @@ from hwp_bench.results.schema import environment
 from hwp_bench.run.engine import Engine, LocalEngine, Needs
 from hwp_bench.run.runner import DEFAULT_TIME_LIMIT, rehearse_method
 from hwp_bench.run.sandbox.confinement import Confinement
-from hwp_bench.sim.produce.suites import SuiteItem, is_rendered, suite
+from hwp_bench.sim.produce.capture import SuiteItem, is_rendered, suite
 
 #: Most seconds that a method may take to be made before the first capture.
 REHEARSAL_SECONDS = 600.0

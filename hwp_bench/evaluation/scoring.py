@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hwp_bench.base.errors import BadCapture, BadInput, BadPrediction, HwpError, bounded
+from hwp_bench.base.errors import BadCapture, BadInput, HwpError, bounded
 from hwp_bench.base.files import read_json
 from hwp_bench.base.images import MAX_PIXELS, pixel_digest, read_rgb
 from hwp_bench.capture import Capture
@@ -149,17 +149,12 @@ def score_predictions(
 ) -> list[FrameResult]:
     """Score predictions in every protocol."""
     frames = [
-        Frame(
-            BadPrediction(one.failure or "") if one.pixels is None else one.pixels,
-            target.pixels,
-            target.mask,
-            coverage=target.exact,
-        )
+        Frame(one.pixels, target.pixels, target.mask, coverage=target.exact)
         for target, one in zip(targets, predictions, strict=True)
     ]
     return [
-        FrameResult(target.frame, dict(score.values), score.failure)
-        for target, score in zip(targets, score_frames(frames, networks=networks), strict=True)
+        FrameResult(one.frame, scores, one.failure)
+        for one, scores in zip(predictions, score_frames(frames, networks=networks), strict=True)
     ]
 
 

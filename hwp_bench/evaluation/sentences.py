@@ -14,7 +14,7 @@ from hwp_bench.evaluation.scoring import read_warnings
 from hwp_bench.results import CaptureResult, FrameResult, Results
 from hwp_bench.results.schema import isolation_text
 from hwp_bench.run.worker import LOG
-from hwp_bench.sim.produce.suites import SuiteItem, suite
+from hwp_bench.sim.produce.capture import SuiteItem, suite
 
 #: Most frames that are named of a capture; the others are counted.
 SHOWN = 12

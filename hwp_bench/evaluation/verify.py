@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product, zip_longest
 from pathlib import Path
@@ -28,7 +28,7 @@ from hwp_bench.capture.check import check_capture
 from hwp_bench.capture.splits import Split, split_for
 from hwp_bench.evaluation.artifacts import FREE_PREDICTIONS
 from hwp_bench.evaluation.capture_evaluation import RESULT, key_of
-from hwp_bench.evaluation.scoring import ScoredFrames, Target, read_targets, score_frames_of
+from hwp_bench.evaluation.scoring import Target, read_targets, score_frames_of
 from hwp_bench.evaluation.sentences import find_missing, find_other_captures, is_of_suite
 from hwp_bench.metrics import METRICS, PROTOCOLS, metric_names
 from hwp_bench.metrics.lpips import load_available
@@ -44,7 +44,7 @@ from hwp_bench.results import (
 )
 from hwp_bench.results.schema import MAX_BYTES, code_digest, environment
 from hwp_bench.results.store import content_digest
-from hwp_bench.sim.produce.suites import suite_names
+from hwp_bench.sim.produce.capture import suite_names
 
 #: Largest difference of a score that rounding on another processor may make.
 TOLERANCE = 1e-6
@@ -132,21 +132,28 @@ def verify_results(
         if record.failure is not None and drawn:
             text = f"{drawn} frames have predictions"
             found.append(Discrepancy(record.id, "failure", "every frame", text))
-        found += _key_differences(results, record, capture)
-    found += _suite_differences(results, fitting, own_splits=splits is not None)
+        clip = None if capture is None or capture.free_view is None else capture.free_view.digest
+        # The key binds method, settings, seed, budget and protocols. A clip that was made after
+        # the evaluation is in no key of it.
+        clips = {None, clip} if record.free_view is None else {record.free_view.digest}
+        if record.key not in {key_of(results, record, digest) for digest in clips}:
+            text = (
+                "another: method, settings, seed, budget, frames, protocols or metrics were changed"
+            )
+            found.append(Discrepancy(record.id, "key", record.key, text))
+    if results.suite in suite_names():
+        problems = find_missing(results) if splits is None else find_other_captures(results)
+        foreign = [one.info.id for one in fitting if not is_of_suite(one.info, results.suite)]
+        problems += [f"is of other scenes or sizes: {', '.join(foreign)}"] if foreign else []
+        found += [Discrepancy("", "suite", results.suite, problem) for problem in problems]
     found += copy_differences(file.parent, stored, RESULT)
     notes = _notes(results, scorer.networks)
     own = results.environment.get("code") == code_digest()
-    found += digest_differences(stored, expected=own)
+    found += digest_differences(stored)
     if own:
         found += _table_differences(file.parent, results)
-    else:
-        if (file.parent / "tables").is_dir():
-            notes.append("The tables next to it were not compared: other code made them.")
-        if stored.get("digest") is None:
-            notes.append(
-                "It states no digest of its content: times and curves are as the file says."
-            )
+    elif (file.parent / "tables").is_dir():
+        notes.append("The tables next to it were not compared: other code made them.")
     return Verification(
         str(file), scored, scorer.frames, tuple(found), tuple(notes), scorer.cross_checked
     )
@@ -170,48 +177,58 @@ def _capture_differences(
     capture: Capture,
     splits: Mapping[str, Split] | None,
     scorer: _Scorer,
-) -> list[Discrepancy]:
+) -> Iterator[Discrepancy]:
     """Compare one capture of a result, and the free-view clip in it, with what is stored of it."""
     name = record.id
     damage = [item for item in check_capture(capture.root).findings if item.level == "error"]
     if damage:
         problem = f"{damage[0].where}: {damage[0].problem}"
-        return [Discrepancy(name, "capture", "an intact capture", problem)]
+        yield Discrepancy(name, "capture", "an intact capture", problem)
+        return
     try:
         split = split_for(name, len(capture), splits)
     except BadSplit as error:
-        return [Discrepancy(name, "split", record.split_digest, error.problem)]
-    found: list[Discrepancy] = []
+        yield Discrepancy(name, "split", record.split_digest, error.problem)
+        return
     numbers = [frame.frame for frame in record.frames]
     if split.digest != record.split_digest:
-        found.append(Discrepancy(name, "split", record.split_digest, split.digest))
+        yield Discrepancy(name, "split", record.split_digest, split.digest)
     elif split.test.tolist() != numbers:
-        found.append(Discrepancy(name, "frames", str(numbers), str(split.test.tolist())))
+        yield Discrepancy(name, "frames", str(numbers), str(split.test.tolist()))
     if any(not 0 <= number < len(capture) for number in numbers):
-        return found
+        return
     targets = read_targets(capture, numbers)
-    found += _label_differences(record, capture, all(target.exact for target in targets))
+    labels = {
+        "hands": capture.info.hands,
+        "perturbations": list(capture.info.perturbations),
+        "exact_masks": all(target.exact for target in targets),
+        "made_by": capture.info.made_by,
+    }
+    for label, value in labels.items():
+        if getattr(record, label) != value:
+            yield Discrepancy(name, label, _brief(getattr(record, label)), _brief(value))
     folder = inside(root, f"captures/{name}/predictions")
-    found += scorer.compare(name, record, targets, folder, capture.size)
-    return found + _free_view_differences(root, record, capture, scorer)
+    yield from scorer.compare(name, record, targets, folder, capture.size)
+    yield from _free_view_differences(root, record, capture, scorer)
 
 
 def _free_view_differences(
     root: Path, record: CaptureResult, capture: Capture, scorer: _Scorer
-) -> list[Discrepancy]:
+) -> Iterator[Discrepancy]:
     """The same of the free-view clip; nothing where the result has no scores of it."""
     stored, clip, name = record.free_view, capture.free_view, f"{record.id}, free view"
     folder = inside(root, f"captures/{record.id}/{FREE_PREDICTIONS}")
     if stored is None:
-        left = clip is not None and folder.is_dir()
-        return [Discrepancy(name, "scores", "none", "predictions")] if left else []
-    if clip is None or clip.digest != stored.digest:
-        here = "no clip" if clip is None else clip.digest
-        return [Discrepancy(name, "capture", stored.digest, here)]
+        if clip is not None and folder.is_dir():
+            yield Discrepancy(name, "scores", "none", "predictions")
+        return
     numbers = [frame.frame for frame in stored.frames]
-    if numbers != list(range(len(clip))):
-        return [Discrepancy(name, "frames", str(numbers), f"0 to {len(clip) - 1}")]
-    return scorer.compare(name, stored, read_targets(clip, numbers), folder, clip.size)
+    if clip is None or clip.digest != stored.digest:
+        yield Discrepancy(name, "capture", stored.digest, clip.digest if clip else "no clip")
+    elif numbers != list(range(len(clip))):
+        yield Discrepancy(name, "frames", str(numbers), f"0 to {len(clip) - 1}")
+    else:
+        yield from scorer.compare(name, stored, read_targets(clip, numbers), folder, clip.size)
 
 
 class _Scorer:
@@ -228,23 +245,16 @@ class _Scorer:
         targets: Sequence[Target],
         folder: Path,
         size: tuple[int, int],
-    ) -> list[Discrepancy]:
+    ) -> Iterator[Discrepancy]:
         """Compare recorded scores with those of the predictions in a folder."""
         scored = score_frames_of(targets, folder, size, self.networks)
-        found = []
-        if scored.digest != record.predictions_digest:
-            found.append(Discrepancy(name, "predictions", record.predictions_digest, scored.digest))
-        for old, new in zip(record.frames, scored.scores, strict=True):
-            found += _frame_differences(name, old, new)
         self.frames += len(targets)
-        return found + self._cross_check(name, record.frames, scored)
-
-    def _cross_check(
-        self, name: str, frames: Sequence[FrameResult], scored: ScoredFrames
-    ) -> list[Discrepancy]:
-        """Compare some recorded scores with scikit-image's."""
-        found = []
-        rows = zip(scored.targets, scored.predictions, frames, strict=True)
+        if scored.digest != record.predictions_digest:
+            yield Discrepancy(name, "predictions", record.predictions_digest, scored.digest)
+        for old, new in zip(record.frames, scored.scores, strict=True):
+            yield from _frame_differences(name, old, new)
+        # Some scores are compared with scikit-image's too.
+        rows = zip(targets, scored.predictions, record.frames, strict=True)
         valid = [(target, one.pixels, old) for target, one, old in rows if one.pixels is not None]
         for place in sample_frames(len(valid)) if valid else []:
             target, pixels, old = valid[place]
@@ -253,16 +263,14 @@ class _Scorer:
                 recorded = old.scores.get(metric)
                 if recorded is None or abs(recorded - value) > CROSS_TOLERANCE:
                     what = f"frame {old.frame}, {metric} by scikit-image"
-                    found.append(Discrepancy(name, what, repr(recorded), repr(value)))
+                    yield Discrepancy(name, what, repr(recorded), repr(value))
             self.cross_checked += 1
-        return found
 
 
-def _frame_differences(name: str, old: FrameResult, new: FrameResult) -> list[Discrepancy]:
-    place, found = f"frame {old.frame}", []
+def _frame_differences(name: str, old: FrameResult, new: FrameResult) -> Iterator[Discrepancy]:
+    place = f"frame {old.frame}"
     if (old.failure is None) != (new.failure is None):
-        texts = old.failure or "none", new.failure or "none"
-        found.append(Discrepancy(name, f"{place}, failure", *texts))
+        yield Discrepancy(name, f"{place}, failure", old.failure or "none", new.failure or "none")
     for metric in [*(name for name in new.scores if name not in old.scores), *old.scores]:
         before, again = old.scores.get(metric), new.scores.get(metric)
         if before is None or again is None:
@@ -270,12 +278,9 @@ def _frame_differences(name: str, old: FrameResult, new: FrameResult) -> list[Di
         else:
             differs = abs(again - before) > TOLERANCE
         if differs:
-            texts = (
-                "not there" if before is None else repr(before),
-                "no such metric" if again is None else repr(again),
-            )
-            found.append(Discrepancy(name, f"{place}, {metric}", *texts))
-    return found
+            recorded = "not there" if before is None else repr(before)
+            now = "no such metric" if again is None else repr(again)
+            yield Discrepancy(name, f"{place}, {metric}", recorded, now)
 
 
 def _with_weights() -> set[str]:
@@ -347,9 +352,8 @@ def _scored_region(mask: np.ndarray, erosion: int, coverage: bool) -> np.ndarray
     if coverage:
         return np.asarray(mask == 255)
     # The hand's border is where the background reaches; the frame's border takes nothing away.
-    background = (mask <= 127).astype(np.uint8)
-    side = 2 * erosion + 1
-    return np.asarray(dilation(background, np.ones((side, side), np.uint8)) == 0)
+    square = np.ones((2 * erosion + 1,) * 2, np.uint8)
+    return np.asarray(dilation((mask <= 127).astype(np.uint8), square) == 0)
 
 
 def _psnr(x: np.ndarray, y: np.ndarray, cap: float) -> float:
@@ -365,53 +369,10 @@ def _psnr(x: np.ndarray, y: np.ndarray, cap: float) -> float:
 # --- what no pixel decides
 
 
-def _label_differences(record: CaptureResult, capture: Capture, exact: bool) -> list[Discrepancy]:
-    """Compare what a result says of a capture with what the capture says of itself."""
-    wanted = {
-        "hands": capture.info.hands,
-        "perturbations": list(capture.info.perturbations),
-        "exact_masks": exact,
-        "made_by": capture.info.made_by,
-    }
-    return [
-        Discrepancy(record.id, name, _brief(getattr(record, name)), _brief(value))
-        for name, value in wanted.items()
-        if getattr(record, name) != value
-    ]
-
-
-def _key_differences(
-    results: Results, record: CaptureResult, capture: Capture | None
-) -> list[Discrepancy]:
-    """Compute the key of a capture again: it binds method, settings, seed, budget and protocols."""
-    clip = None if capture is None or capture.free_view is None else capture.free_view.digest
-    # A clip that was made after the evaluation is in no key of it.
-    clips = {None, clip} if record.free_view is None else {record.free_view.digest}
-    if record.key in {key_of(results, record, digest) for digest in clips}:
-        return []
-    found = "another: method, settings, seed, budget, frames, protocols or metrics were changed"
-    return [Discrepancy(record.id, "key", record.key, found)]
-
-
-def _suite_differences(
-    results: Results, captures: Sequence[Capture], *, own_splits: bool = False
-) -> list[Discrepancy]:
-    """Compare a result with the suite that it names: captures, splits, frames and scenes."""
-    if results.suite not in suite_names():
-        return []
-    problems = find_other_captures(results) if own_splits else find_missing(results)
-    foreign = [item.info.id for item in captures if not is_of_suite(item.info, results.suite)]
-    if foreign:
-        problems.append(f"is of other scenes or sizes: {', '.join(foreign)}")
-    return [Discrepancy("", "suite", results.suite, problem) for problem in problems]
-
-
-def digest_differences(value: Mapping[str, Any], *, expected: bool) -> list[Discrepancy]:
+def digest_differences(value: Mapping[str, Any]) -> list[Discrepancy]:
     """Compare a result file with the digest that it states of its own content."""
     stated, found = content_digest(value)
-    if stated == found or (stated is None and not expected):
-        return []
-    return [Discrepancy("", "digest", _brief(stated), found)]
+    return [] if stated == found else [Discrepancy("", "digest", _brief(stated), found)]
 
 
 def copy_differences(root: Path, value: Mapping[str, Any], name: str) -> list[Discrepancy]:
@@ -436,13 +397,13 @@ def copy_differences(root: Path, value: Mapping[str, Any], name: str) -> list[Di
     return found
 
 
-def _table_differences(root: Path, results: Results) -> list[Discrepancy]:
+def _table_differences(root: Path, results: Results) -> Iterator[Discrepancy]:
     """Make the tables that an evaluation wrote next to its result again, and compare them."""
     try:
         tables = {**all_tables([results]), **free_view_tables([results])}
     except HwpError as error:
-        return [Discrepancy("", "tables", "tables of the result", error.problem)]
-    found = []
+        yield Discrepancy("", "tables", "tables of the result", error.problem)
+        return
     for (name, table), ending in product(tables.items(), FORMATS):
         what, made = f"tables/{name}.{ending}", format_table(table, ending)
         try:
@@ -453,8 +414,7 @@ def _table_differences(root: Path, results: Results) -> list[Discrepancy]:
         if text != made:
             lines = zip_longest(text.splitlines(), made.splitlines(), fillvalue="")
             first = ((a[:_SHOWN], b[:_SHOWN]) for a, b in lines if a != b)
-            found.append(Discrepancy("", what, *next(first, ("", "other line ends"))))
-    return found
+            yield Discrepancy("", what, *next(first, ("", "other line ends")))
 
 
 def _brief(value: Any) -> str:

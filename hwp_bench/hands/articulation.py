@@ -103,11 +103,7 @@ def right_jacobian(vectors: np.ndarray) -> np.ndarray:
 def matrix_to_axis_angle(matrix: torch.Tensor) -> torch.Tensor:
     """Axis-angle vectors of rotation matrices, stable at zero and at half a turn.
 
-    Args:
-        matrix: (..., 3, 3) rotation matrices.
-
-    Returns:
-        (..., 3) rad, of length at most pi; differentiable short of half a turn.
+    (..., 3) rad of (..., 3, 3), of length at most pi; differentiable short of half a turn.
 
     Source: the quaternion is the largest of its four algebraically equal forms (Shepperd).
     """
@@ -205,14 +201,11 @@ def joint_angles(pose: torch.Tensor, axes: torch.Tensor) -> torch.Tensor:
 
 
 def pose_from_joint_angles(angles: torch.Tensor, axes: torch.Tensor) -> torch.Tensor:
-    """Invert `joint_angles`: compute axis-angle vectors of the 15 finger joints.
+    """Invert `joint_angles`: axis-angle vectors (B, 15, 3) rad of joints 1 to 15 of a pose.
 
     Args:
         angles: (B, 15, 3) rad: flexion, abduction, twist.
         axes: (15, 3, 3) from `joint_axes`, of the angles' type.
-
-    Returns:
-        (B, 15, 3) axis-angle rad, joints 1 to 15 of a pose.
     """
     turns = axis_angle_to_matrix(angles[..., None] * axes.mT)
     return matrix_to_axis_angle(turns[..., 0, :, :] @ turns[..., 1, :, :] @ turns[..., 2, :, :])

@@ -195,9 +195,8 @@ def landmark_rows(
 ) -> np.ndarray:
     """How landmarks move with the parameters, in units of their errors: (F, 105, 51).
 
-    Args:
-        image_spread: error of each landmark in the image, slopes: (F, 21), or one for all.
-        space_spread: error of each in space against the hand's centre, m: (F, 21, 3), or one.
+    Errors are those in the image, slopes: (F, 21), and in space against the hand's centre, m:
+    (F, 21, 3), or one for all.
     """
     moves, points = movement(posed), posed.landmarks
     depth = points[..., 2]

@@ -87,12 +87,15 @@ def pose_hand(
     joints = joints + transl[:, None]
     shifts = joints - (turns @ rest_joints[..., None])[..., 0]
     vertices = _blend_skin(rest, turns, shifts, template.weights)
+    top = torch.cat([turns, shifts[..., None]], dim=-1)
+    bottom = torch.zeros_like(top[..., :1, :])
+    bottom[..., 3] = 1.0
     points = torch.cat([joints, vertices[:, template.fingertips]], dim=1)
     return PosedHand(
         vertices=vertices,
         joints=joints,
         landmarks=torch.cat([points[:, rows] for rows in _landmark_rows()], dim=1),
-        transforms=_homogeneous(turns, shifts),
+        transforms=torch.cat([top, bottom], dim=-2),
     )
 
 
@@ -199,10 +202,3 @@ def _blend_skin(
     images = (weights @ motions).unflatten(-1, (4, 3))
     x, y, z = rest.split(1, dim=-1)
     return images[..., 0, :] * x + images[..., 1, :] * y + images[..., 2, :] * z + images[..., 3, :]
-
-
-def _homogeneous(turns: torch.Tensor, shifts: torch.Tensor) -> torch.Tensor:
-    top = torch.cat([turns, shifts[..., None]], dim=-1)
-    bottom = torch.zeros_like(top[..., :1, :])
-    bottom[..., 3] = 1.0
-    return torch.cat([top, bottom], dim=-2)

@@ -4,31 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any
-
-from markupsafe import Markup
 
 from hwp_bench.analysis.columns import Filled, score_column, table_of
 from hwp_bench.analysis.compare import Rank, compare, rank_methods, verdict
-from hwp_bench.analysis.cost import analyse_cost
 from hwp_bench.analysis.pairing import MACRO, group_runs, same_but_seed
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.tables import Column, Table
-from hwp_bench.capture.splits import split_for
 from hwp_bench.evaluation.sentences import find_missing
 from hwp_bench.leaderboard.entries import BADGES, LEVELS, Entry
 from hwp_bench.leaderboard.rules import HEADLINE, current, source_of, tables_of, takes_over
-from hwp_bench.leaderboard.suite_data import on_current_data
+from hwp_bench.leaderboard.suite_data import Severities, on_current_data, suite_severities
 from hwp_bench.metrics import HWP_V1
 from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.metrics.score import CaptureScores, aggregate
-from hwp_bench.report.figures import draw_pareto, inline_svg
 from hwp_bench.report.study_tables import METRIC
 from hwp_bench.results import CaptureResult, Results
 from hwp_bench.results.schema import score_rows
-from hwp_bench.sim.produce.suites import suite
-from hwp_bench.sim.scene.motion import moments, severity
 from hwp_bench.taxonomy import PERTURBATIONS, perturbation
 
 #: The badge of a row is the first of these that one of its entries has.
@@ -193,54 +186,24 @@ def _older(row: BoardRow, own: Iterable[Entry]) -> tuple[Entry, ...]:
 
 def _labels(rows: Sequence[BoardRow]) -> list[str]:
     """Titles, with the submitter and at last the entry where they do not tell rows apart."""
-    titles = [row.title for row in rows]
-    named = [
-        f"{title} (by {row.entries[0].submission.by or 'somebody who is not named'})"
-        for title, row in zip(titles, rows, strict=True)
+    stages = [
+        [row.title for row in rows],
+        [
+            f"{row.title} (by {row.entries[0].submission.by or 'somebody who is not named'})"
+            for row in rows
+        ],
+        [f"{row.title} ({row.name})" for row in rows],
     ]
-    entries = [f"{title} ({row.name})" for title, row in zip(titles, rows, strict=True)]
-    labels = []
-    for place, title in enumerate(titles):
-        texts = ((title, titles), (named[place], named), (entries[place], entries))
-        labels.append(next(text for text, all_ in texts if all_.count(text) == 1))
-    return labels
-
-
-#: By capture and perturbation: mean severity of the frames that show it, rounded.
-Severities = Mapping[str, Mapping[str, int]]
-
-
-@cache
-def suite_severities(name: str) -> Severities:
-    """Return how severe each perturbation of each capture of a suite is.
-
-    It is read from the scenes, so that no capture has to be on this machine: the mean over the
-    frames to learn from that show the perturbation, rounded, as `hwp-bench table --by severity`
-    takes it from captures.
-    """
-    found: dict[str, dict[str, int]] = {}
-    for item in suite(name):
-        test = set(split_for(item.scene.id, item.frame_count).test.tolist())
-        learnt = [
-            moment
-            for frame, moment in enumerate(moments(item.frame_count).tolist())
-            if frame not in test
-        ]
-        own = found.setdefault(item.scene.id, {})
-        for call in item.scene.effects:
-            shown = [value for moment in learnt if (value := severity(call, moment))]
-            own[call.kind] = round(sum(shown) / len(shown)) if shown else 0
-    return found
+    return [
+        next(texts[place] for texts in stages if texts.count(texts[place]) == 1)
+        for place in range(len(rows))
+    ]
 
 
 def at_severity(
     captures: Sequence[CaptureScores], severities: Severities, level: int
 ) -> list[CaptureScores]:
-    """Return the captures that have a perturbation of one severity, with these perturbations only.
-
-    Returns:
-        Fewer captures; empty where none has a perturbation of that severity.
-    """
+    """Return the captures that have a perturbation of one severity, with these perturbations."""
     found = []
     for capture in captures:
         own = severities.get(capture.id, {})
@@ -320,17 +283,16 @@ def rankable(rows: Sequence[BoardRow]) -> tuple[list[BoardRow], str]:
     if not whole:
         return [], ""
     single = _one_of_each_run(whole)
-    common = _most_common_seed(single)
+    seeds = sorted({seed for row in single for seed in row.seeds})
+    common = max(seeds, key=lambda seed: sum(seed in row.seeds for row in single))
     stay = [row for row in single if common in row.seeds]
     for row in single:
         if row not in stay and all(set(row.seeds) & set(other.seeds) for other in stay):
             stay.append(row)
     parts = []
-    twins = _names([row for row in whole if row not in single])
-    if twins:
+    if twins := ", ".join(row.name for row in whole if row not in single):
         parts.append(f"No rank for a second entry of the same run: {twins}.")
-    apart = _names([row for row in single if row not in stay])
-    if apart:
+    if apart := ", ".join(row.name for row in single if row not in stay):
         parts.append(
             f"No rank for rows without the seed {common}, which most rows have, and without a "
             f"seed in common with every other row: {apart}."
@@ -340,24 +302,14 @@ def rankable(rows: Sequence[BoardRow]) -> tuple[list[BoardRow], str]:
 
 def _one_of_each_run(rows: Sequence[BoardRow]) -> list[BoardRow]:
     """Leave out rows that have a run (a state of a method and a seed) of a row before them."""
-    order = sorted(rows, key=lambda row: (-LEVELS.index(row.level), row.name))
     seen: set[tuple[str, int]] = set()
     kept = []
-    for row in order:
+    for row in sorted(rows, key=lambda row: (-LEVELS.index(row.level), row.name)):
         runs = {(same_but_seed(row.first), seed) for seed in row.seeds}
         if not runs & seen:
             kept.append(row)
             seen |= runs
     return [row for row in rows if row in kept]
-
-
-def _most_common_seed(rows: Sequence[BoardRow]) -> int:
-    seeds = sorted({seed for row in rows for seed in row.seeds})
-    return max(seeds, key=lambda seed: sum(seed in row.seeds for row in rows))
-
-
-def _names(rows: Sequence[BoardRow]) -> str:
-    return ", ".join(row.name for row in rows)
 
 
 def board_tables(entries: Sequence[Entry]) -> list[Table]:
@@ -373,16 +325,14 @@ def board_tables(entries: Sequence[Entry]) -> list[Table]:
 def _table(suite: str, protocol: str, entries: Sequence[Entry]) -> Table:
     rows = method_rows(entries)
     ranks, sentence = ranks_of(rows)
-    order = sorted(
-        rows,
-        key=lambda row: (
-            not row.whole,
-            ranks[row.name].rank if row.name in ranks else len(rows),
-            -row.scores[METRIC],
-            row.name,
-        ),
-    )
+
+    def place(row: BoardRow) -> tuple[bool, int, float, str]:
+        rank = ranks[row.name].rank if row.name in ranks else len(rows)
+        return not row.whole, rank, -row.scores[METRIC], row.name
+
+    order = sorted(rows, key=place)
     found = [ranks.get(row.name) for row in order]
+    more = [f" and {len(row.seeds) - 1} more" if row.seeds[1:] else "" for row in order]
     columns: list[Filled] = [
         (Column("Method"), [row.title for row in order]),
         (Column("Rank", 0, group="Rank"), [rank.rank if rank else None for rank in found]),
@@ -392,7 +342,7 @@ def _table(suite: str, protocol: str, entries: Sequence[Entry]) -> Table:
         (Column("Seeds", 0), [len(row.seeds) for row in order]),
         (Column("Level"), [row.level for row in order]),
         (Column("Badge"), [row.badge for row in order]),
-        (Column("Entry"), [_entry_text(row) for row in order]),
+        (Column("Entry"), [row.name + text for row, text in zip(order, more, strict=True)]),
     ]
     notes = [sentence] if sentence else []
     lacking = frozenset(place for place, row in enumerate(order) if not row.whole)
@@ -403,10 +353,6 @@ def _table(suite: str, protocol: str, entries: Sequence[Entry]) -> Table:
     if older := sum(len(row.older) for row in rows):
         notes.append(f"{older} older or less checked entries of these methods are not shown.")
     return table_of(f"Suite {suite}, protocol {protocol}", columns, notes, unranked=lacking)
-
-
-def _entry_text(row: BoardRow) -> str:
-    return row.name if len(row.seeds) == 1 else f"{row.name} and {len(row.seeds) - 1} more"
 
 
 def ranks_of(rows: Sequence[BoardRow]) -> tuple[dict[str, Rank], str]:
@@ -423,12 +369,9 @@ def ranks_of(rows: Sequence[BoardRow]) -> tuple[dict[str, Rank], str]:
     runs = group_runs([one for results in compared.values() for one in results])
     ranking = rank_methods(runs, METRIC)
     by_label = {item.standing.label: item for item in ranking.ranks}
-    found = {
-        name: by_label[run.label]
-        for name, (first, *_) in compared.items()
-        for run in runs
-        if any(first is results for results in run.seeds.values())
-    }
+    # What is compared is made anew for each row, so that a run tells which row it is of.
+    run_of = {id(one): run.label for run in runs for one in run.seeds.values()}
+    found = {name: by_label[run_of[id(own[0])]] for name, own in compared.items()}
     return found, f"{verdict(ranking)} {left_out}".rstrip()
 
 
@@ -439,20 +382,14 @@ REFERENCE = "wildghand"
 def reference_lead(rows: Sequence[BoardRow]) -> str:
     """Return one sentence: the reference against the best competitor with the same budget.
 
-    Where the reference has rows of several budgets, the one with most competitors speaks.
-
-    Args:
-        rows: of one suite and one version of the protocol; those that lack a part of the suite do
-            not take part.
-
-    Returns:
-        The sentence, whatever it says; empty where nobody has the budget of the reference, or no
-        seed in common with it.
+    Where the reference has rows of several budgets, the one with most competitors speaks. Rows
+    that lack a part of the suite do not take part. The sentence is empty where nobody has the
+    budget of the reference, or no seed in common with it.
     """
     whole = [row for row in rows if row.whole]
     mine = [row for row in whole if row.first.method.name == REFERENCE]
     others = [row for row in whole if row.first.method.name != REFERENCE]
-    pairs = [(row, [other for other in others if _equal_budget(row, other)]) for row in mine]
+    pairs = [(row, [one for one in others if one.first.budget == row.first.budget]) for row in mine]
     reference, competitors = max(
         pairs, key=lambda pair: (len(pair[1]), pair[0].scores[METRIC]), default=(None, [])
     )
@@ -476,48 +413,3 @@ def reference_lead(rows: Sequence[BoardRow]) -> str:
         return f"{text}; nothing says how sure that is."
     text += f" (95 % interval {lead.low:+.{facts.digits}f} to {lead.high:+.{facts.digits}f}"
     return text + ("; not significant)." if lead.low <= 0.0 <= lead.high else ").")
-
-
-def _equal_budget(one: BoardRow, other: BoardRow) -> bool:
-    return one.first.budget == other.first.budget
-
-
-@dataclass(frozen=True)
-class CurvePlot:
-    """One plot with what its legend needs."""
-
-    #: The plot, an SVG element.
-    figure: Markup
-    #: Labels of the methods, in the order of their colours.
-    methods: Sequence[str]
-    #: Labels of those that are on the Pareto front for some time.
-    front: Sequence[str]
-
-
-def curve_plot(rows: Sequence[BoardRow]) -> CurvePlot | None:
-    """Draw the mean score of validation frames over the seconds of fitting, and the front.
-
-    Args:
-        rows: of one suite and one version of the protocol; those that lack a part of the suite do
-            not take part.
-
-    Returns:
-        The plot, best row first in its legend; None where no row left a curve, or where one
-        submitted twice cannot be told apart.
-    """
-    whole = sorted((row for row in rows if row.whole), key=lambda row: -row.scores[METRIC])
-    try:
-        runs = group_runs([results for row in whole for results in row.compared])
-        cost = analyse_cost(runs, METRIC) if runs else None
-    except UsageError:
-        return None
-    if cost is None:
-        return None
-    order = {curve.label: index for index, curve in enumerate(cost.curves)}
-    figure = draw_pareto(cost.curves, cost.front, METRIC, order)
-    suite = whole[0].first.suite
-    title = f"{metric_facts(METRIC).label} over seconds of fitting on {suite}"
-    leading = {part.label for part in cost.front}
-    return CurvePlot(
-        inline_svg(figure, title), list(order), [label for label in order if label in leading]
-    )

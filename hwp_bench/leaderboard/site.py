@@ -4,166 +4,38 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
 from markdown_it import MarkdownIt
 from markupsafe import Markup
 
-from hwp_bench.base.drawing import error_map, fitted
+from hwp_bench.analysis.cost import analyse_cost
+from hwp_bench.analysis.pairing import group_runs
 from hwp_bench.base.errors import UsageError
-from hwp_bench.base.files import atomic_folder, canonical_json, sha256_json
-from hwp_bench.capture import Capture
-from hwp_bench.evaluation.artifacts import square_around
-from hwp_bench.evaluation.scoring import read_prediction
+from hwp_bench.base.files import atomic_folder, canonical_json
 from hwp_bench.leaderboard.board import (
     SCOPES,
     BoardRow,
     budget_text,
-    curve_plot,
     method_rows,
     ranks_of,
     reference_lead,
     severities_of,
 )
 from hwp_bench.leaderboard.entries import BADGES, LEVEL_TEXTS, Entry, digest
+from hwp_bench.leaderboard.gallery import write_gallery
 from hwp_bench.leaderboard.rules import HEADLINE, SUITES, check_entries, source_of, tables_of
 from hwp_bench.methods.manifest import shipped_methods
 from hwp_bench.metrics import HWP_V1
 from hwp_bench.metrics import metric as metric_facts
-from hwp_bench.metrics.pixels import scored_pixels
+from hwp_bench.report.figures import draw_pareto, inline_svg
 from hwp_bench.report.page import provenance, render_template, style_sheet, write_report
 from hwp_bench.report.sources import ResultsSource, open_captures_of
-from hwp_bench.results import CaptureResult, Results
+from hwp_bench.report.study_tables import METRIC
 from hwp_bench.results.published import NOTE, read_published
-
-#: Test frames of each capture that are shown at most, evenly spread.
-FRAMES = 6
-#: Edge of a picture, px.
-EDGE = 384
-#: Quality of JPEG; a picture of this edge takes some 12 kB.
-QUALITY = 82
-
-
-@dataclass(frozen=True)
-class Shot:
-    """The drawing of one frame by one method."""
-
-    #: Name of the entry.
-    entry: str
-    #: Title of the method, with its budget.
-    title: str
-    #: The drawing and its error map, as addresses within the site.
-    picture: str
-    error: str
-    #: PSNR of the frame, dB.
-    psnr: float
-
-
-@dataclass(frozen=True)
-class Scene:
-    """One test frame of one capture."""
-
-    #: The capture's id, with the suite where several suites have one of this name.
-    capture: str
-    #: The frame's index.
-    frame: int
-    #: The truth, as an address within the site.
-    truth: str
-    #: Methods, the best of the suite first: not of the frame, whose scores stand with its pictures.
-    shots: tuple[Shot, ...]
-
-
-def write_gallery(
-    folder: Path,
-    sources: Sequence[tuple[Entry, ResultsSource]],
-    captures: Mapping[str, Capture],
-    titles: Mapping[str, str],
-) -> list[dict[str, Any]]:
-    """Draw every method on a few test frames of every capture, on the scored pixels.
-
-    Nobody chooses the frames: they are evenly spread over the test clip.
-    """
-    by_capture: dict[tuple[str, str], list[tuple[Entry, ResultsSource, CaptureResult]]] = {}
-    ranked = sorted(sources, key=lambda pair: -pair[0].results.scores["psnr"])
-    for entry, source in ranked:
-        for result in source.results.captures:
-            if result.digest in captures:
-                key = (source.results.suite, result.digest)
-                by_capture.setdefault(key, []).append((entry, source, result))
-    order = sorted(by_capture, key=lambda key: _place(key[0], captures[key[1]].info.id))
-    ids = [captures[data].info.id for _, data in order]
-    scenes = []
-    for suite, data in order:
-        capture = captures[data]
-        several = ids.count(capture.info.id) > 1
-        name = f"{capture.info.id} of {suite}" if several else capture.info.id
-        scenes += _scenes(folder, capture, name, by_capture[suite, data], titles)
-    return [asdict(scene) for scene in scenes]
-
-
-def _place(suite: str, identifier: str) -> tuple[int, int, str]:
-    """The place of a capture in lists: `capture10` comes after `capture9`."""
-    return SUITES.index(suite), len(identifier), identifier
-
-
-def _scenes(
-    folder: Path,
-    capture: Capture,
-    name: str,
-    found: Sequence[tuple[Entry, ResultsSource, CaptureResult]],
-    titles: Mapping[str, str],
-) -> list[Scene]:
-    common = set.intersection(*({item.frame for item in row.frames} for _, _, row in found))
-    # The name of a folder is made of a digest: a capture's own id comes from outside.
-    place = f"pictures/{sha256_json(capture.info.to_json())[:12]}"
-    (folder / place).mkdir(parents=True, exist_ok=True)
-    scenes = []
-    for frame in _spread(sorted(common)):
-        target = capture.frame(frame)
-        mask, exact = capture.scoring_mask(frame)
-        region = scored_pixels(mask, erosion=HWP_V1.mask_erosion, coverage=exact)
-        box = square_around(region)
-        truth = f"{place}/{frame}-truth.jpg"
-        _write(folder / truth, np.where(region[..., None], target, 0)[box])
-        shots = []
-        for entry, source, result in found:
-            predictions = source.place(result.id, "predictions")
-            pixels = None
-            if predictions is not None:
-                pixels = read_prediction(predictions, frame, capture.size).pixels
-            if pixels is None:
-                continue
-            picture, error = (
-                f"{place}/{frame}-{digest(entry.results)[:12]}{end}.jpg" for end in ("", "-e")
-            )
-            _write(folder / picture, np.where(region[..., None], pixels, 0)[box])
-            _write(folder / error, error_map(pixels, target, region)[box])
-            psnr = next(item.scores["psnr"] for item in result.frames if item.frame == frame)
-            shots.append(Shot(entry.name, titles[entry.name], picture, error, psnr))
-        if shots:
-            scenes.append(Scene(name, frame, truth, tuple(shots)))
-    return scenes
-
-
-def _spread(frames: Sequence[int]) -> list[int]:
-    """At most `FRAMES` of some frames, evenly spread, the first and the last among them."""
-    if len(frames) <= FRAMES:
-        return list(frames)
-    return [frames[round(k * (len(frames) - 1) / (FRAMES - 1))] for k in range(FRAMES)]
-
-
-def _write(path: Path, image: np.ndarray) -> None:
-    """Write a JPEG; the folder is a temporary one, so that a half of it is never seen."""
-    shown = cv2.cvtColor(fitted(np.ascontiguousarray(image), EDGE), cv2.COLOR_RGB2BGR)
-    done, data = cv2.imencode(".jpg", shown, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
-    assert done
-    path.write_bytes(data.tobytes())
-
 
 #: Longest text of a method that is shown, characters.
 _LONGEST = 60_000
@@ -189,10 +61,11 @@ def method_pages(rows: Sequence[BoardRow]) -> list[MethodPage]:
         _, by = source_of(row.entries[0])
         found.setdefault((row.first.method.name, by), []).append(row)
     # Names come from outside: the number keeps two of them apart, whatever is left of them.
-    return [
-        MethodPage(f"methods/{number}-{_slug(name)}.html", name, own[0].title, own)
-        for number, ((name, _), own) in enumerate(sorted(found.items(), key=lambda x: x[0]))
-    ]
+    pages = []
+    for number, ((name, _), own) in enumerate(sorted(found.items(), key=lambda x: x[0])):
+        slug = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")[:60] or "method"
+        pages.append(MethodPage(f"methods/{number}-{slug}.html", name, own[0].title, own))
+    return pages
 
 
 def write_method_pages(
@@ -220,10 +93,6 @@ def write_method_pages(
             why_older=BoardRow.why_older,
         )
         (folder / page.path).write_text(html, encoding="utf-8")
-
-
-def _slug(name: str) -> str:
-    return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")[:60] or "method"
 
 
 def _formatted(text: str) -> Markup:
@@ -267,7 +136,7 @@ def _avatars(folder: Path, page: MethodPage) -> dict[str, str]:
 def _made_with(row: BoardRow) -> dict[str, str]:
     """Say in words how the numbers of a row were made; empty where it is not known."""
     results = row.first
-    captures = [capture for entry in row.entries for capture in entry.results.captures]
+    captures = row.captures
     cpu = [capture.cpu_seconds for capture in captures if capture.cpu_seconds is not None]
     seeds = ", ".join(str(seed) for seed in row.seeds)
     return provenance(results) | {
@@ -331,13 +200,16 @@ def build_site(
         titles = _titles([entry for entry, _ in shown])
         scenes = write_gallery(temporary, shown, captures, titles)
         pages = method_pages(rows)
-        page = board_page(rows, pictures=bool(scenes), pages=_addresses(pages))
-        (temporary / "index.html").write_text(page, encoding="utf-8")
-        (temporary / "board.js").write_text(script(), encoding="utf-8")
+        addresses = {row.name: page.path for page in pages for row in page.rows}
+        files = {
+            "index.html": board_page(rows, pictures=bool(scenes), pages=addresses),
+            "board.js": script(),
+        }
         if scenes:
-            data = f"var GALLERY = {canonical_json(scenes)};\n"
-            (temporary / "gallery.js").write_text(data, encoding="utf-8")
-            (temporary / "viewer.js").write_text(script("viewer.js"), encoding="utf-8")
+            files["gallery.js"] = f"var GALLERY = {canonical_json(scenes)};\n"
+            files["viewer.js"] = script("viewer.js")
+        for name, text in files.items():
+            (temporary / name).write_text(text, encoding="utf-8")
         for entry in entries:
             source = ResultsSource(entry.results, folders.get(digest(entry.results)))
             report = temporary / "reports" / entry.name
@@ -357,59 +229,35 @@ def _titles(entries: Sequence[Entry]) -> dict[str, str]:
     names: dict[str, str] = {}
     for suite in {entry.results.suite for entry in entries}:
         rows = [entry for entry in entries if entry.results.suite == suite]
-        for parts in (_title, _title_budget, _title_budget_digest):
-            texts = [parts(entry.results) for entry in rows]
-            names |= {
-                entry.name: text
-                for entry, text in zip(rows, texts, strict=True)
-                if entry.name not in names and texts.count(text) == 1
-            }
-        names |= {entry.name: entry.name for entry in rows if entry.name not in names}
+        told = []
+        for entry in rows:
+            method, budget = entry.results.method, budget_text(entry.results.budget)
+            whole = f"{method.title} ({budget}, {method.digest[:8]})"
+            told.append((method.title, f"{method.title} ({budget})", whole, entry.name))
+        for texts in zip(*told, strict=True):
+            for entry, text in zip(rows, texts, strict=True):
+                if texts.count(text) == 1:
+                    names.setdefault(entry.name, text)
     return names
-
-
-def _title(results: Results) -> str:
-    return results.method.title
-
-
-def _title_budget(results: Results) -> str:
-    return f"{_title(results)} ({budget_text(results.budget)})"
-
-
-def _title_budget_digest(results: Results) -> str:
-    return f"{_title(results)} ({budget_text(results.budget)}, {results.method.digest[:8]})"
 
 
 def shown_rows(entries: Sequence[Entry]) -> list[BoardRow]:
     """Return the rows of this version's protocol with what the page shows of them, best first."""
-    found = [
-        row
-        for (_, protocol), own in tables_of(entries).items()
-        if protocol == HWP_V1.name
-        for row in method_rows(own)
-    ]
-    return sorted(
-        found,
-        key=lambda row: (
-            SUITES.index(row.suite),
-            not row.whole,
-            -(row.scopes["macro"]["psnr"] or 0.0),
-            row.name,
-        ),
-    )
 
+    def place(row: BoardRow) -> tuple[int, bool, float, str]:
+        score = row.scopes["macro"]["psnr"] or 0.0
+        return SUITES.index(row.suite), not row.whole, -score, row.name
 
-def _addresses(pages: Sequence[MethodPage]) -> dict[str, str]:
-    """The page of the method of each row, by the row's name."""
-    return {row.name: page.path for page in pages for row in page.rows}
+    tables = tables_of(entries).items()
+    own = [entries for (_, protocol), entries in tables if protocol == HWP_V1.name]
+    return sorted((row for entries in own for row in method_rows(entries)), key=place)
 
 
 def board_page(rows: Sequence[BoardRow], *, pictures: bool, pages: Mapping[str, str]) -> str:
     """Return the page of the board."""
     suites = list(dict.fromkeys(row.suite for row in rows))
     ranks: dict[str, tuple[int, str]] = {}
-    leads, verdicts = [], {}
-    plots = {}
+    leads, verdicts, plots = [], {}, {}
     for suite in suites:
         table = [row for row in rows if row.suite == suite]
         placed, verdicts[suite] = ranks_of(table)
@@ -423,9 +271,9 @@ def board_page(rows: Sequence[BoardRow], *, pictures: bool, pages: Mapping[str, 
         style=style_sheet(),
         rows=rows,
         ranks=ranks,
-        leads=[text for text in leads if text],
+        leads=list(filter(None, leads)),
         verdicts={suite: text for suite, text in verdicts.items() if text},
-        plots={suite: plot for suite, plot in plots.items() if plot is not None},
+        plots={suite: plot for suite, plot in plots.items() if plot},
         pages=pages,
         scopes=SCOPES,
         severities=severities_of(rows),
@@ -439,6 +287,30 @@ def board_page(rows: Sequence[BoardRow], *, pictures: bool, pages: Mapping[str, 
         levels=LEVEL_TEXTS,
         badges=BADGES,
     )
+
+
+def curve_plot(rows: Sequence[BoardRow]) -> dict[str, Any] | None:
+    """Draw the mean score of validation frames over the seconds of fitting, and the front.
+
+    Returns:
+        The plot (`figure`), the labels of the methods in the order of their colours (`methods`),
+        and of those on the Pareto front for some time (`front`). None where no whole row left a
+        curve, or where one submitted twice cannot be told apart.
+    """
+    whole = sorted((row for row in rows if row.whole), key=lambda row: -row.scores[METRIC])
+    try:
+        runs = group_runs([results for row in whole for results in row.compared])
+        cost = analyse_cost(runs, METRIC) if runs else None
+    except UsageError:
+        return None
+    if cost is None:
+        return None
+    order = {curve.label: index for index, curve in enumerate(cost.curves)}
+    title = f"{metric_facts(METRIC).label} over seconds of fitting on {whole[0].first.suite}"
+    figure = inline_svg(draw_pareto(cost.curves, cost.front, METRIC, order), title)
+    leading = {part.label for part in cost.front}
+    front = [label for label in order if label in leading]
+    return {"figure": figure, "methods": list(order), "front": front}
 
 
 def _scores_json(row: BoardRow, metric: str) -> str:

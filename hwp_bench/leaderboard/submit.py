@@ -34,7 +34,7 @@ from hwp_bench.leaderboard.suite_data import on_current_data
 from hwp_bench.report.sources import ResultsSource
 from hwp_bench.results import Results, read_results
 from hwp_bench.results.schema import environment
-from hwp_bench.sim.produce.suites import suite
+from hwp_bench.sim.produce.capture import suite
 
 #: Where entries lie in the repository, and in a submission.
 PLACE = "leaderboard/entries"

@@ -1,9 +1,10 @@
-"""The data of the suites: digests of captures and clips, so that no entry can bring its own."""
+"""The data of the suites: digests, so that no entry can bring its own, and severities."""
 
 from __future__ import annotations
 
 import argparse
 import os
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -16,10 +17,11 @@ from hwp_bench.base.files import cache_root, read_json, write_json
 from hwp_bench.base.packages import data_folder
 from hwp_bench.base.records import Digest, Line, parse_record, without_schema
 from hwp_bench.capture import open_capture
+from hwp_bench.capture.splits import split_for
 from hwp_bench.evaluation.sentences import is_of_suite
 from hwp_bench.results import Results
-from hwp_bench.sim.produce.capture import RENDERER
-from hwp_bench.sim.produce.suites import suite_names
+from hwp_bench.sim.produce.capture import RENDERER, suite, suite_names
+from hwp_bench.sim.scene.scene import moments, severity
 
 #: Version of the file.
 SCHEMA = "hwp-suite-data/2"
@@ -92,6 +94,30 @@ def on_current_data(results: Results) -> Results:
             capture = replace(capture, digest=data.current.digest)
         captures.append(capture)
     return replace(results, captures=captures)
+
+
+#: By capture and perturbation: mean severity of the frames that show it, rounded.
+Severities = Mapping[str, Mapping[str, int]]
+
+
+@cache
+def suite_severities(name: str) -> Severities:
+    """Return how severe each perturbation of each capture of a suite is.
+
+    It is read from the scenes, so that no capture has to be on this machine: the mean over the
+    frames to learn from that show the perturbation, rounded, as `hwp-bench table --by severity`
+    takes it from captures.
+    """
+    found: dict[str, dict[str, int]] = {}
+    for item in suite(name):
+        test = set(split_for(item.scene.id, item.frame_count).test.tolist())
+        every = enumerate(moments(item.frame_count).tolist())
+        learnt = [moment for frame, moment in every if frame not in test]
+        own = found.setdefault(item.scene.id, {})
+        for call in item.scene.effects:
+            shown = [value for moment in learnt if (value := severity(call, moment))]
+            own[call.kind] = round(sum(shown) / len(shown)) if shown else 0
+    return found
 
 
 def rendered_data(cache: Path) -> SuiteData:

@@ -9,7 +9,7 @@ import stat
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 
-from hwp_bench.base.errors import BadInput, BadMethod
+from hwp_bench.base.errors import BadInput, BadMethod, UsageError
 from hwp_bench.base.files import sha256_of
 from hwp_bench.base.folders import LOCK
 
@@ -21,6 +21,8 @@ LEFT_OUT = frozenset(
 )
 #: Most files of a folder whose digest is taken, and most bytes in them.
 MAX_FILES, MAX_BYTES = 200_000, 64 << 30
+#: Most folders of a method that are looked into.
+MAX_FOLDERS = 20_000
 #: Files that say that a folder is a capture or a result of the toolkit, by their first words.
 _MARKED_FILES = ("capture.json", "results.json")
 _MARK, _HEAD_BYTES = b'"hwp-', 256
@@ -63,23 +65,34 @@ def exposed_digest(paths: Iterable[Path]) -> str:
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
 
-def left_out_folders(root: Path) -> list[Path]:
-    """Return the folders of a method that its digest leaves out.
+def unseen_folders(root: Path, *, ships: bool = False) -> list[Path]:
+    """Return the folders below a method's that it finds empty inside the walls.
 
-    Those in an environment of Python are not listed: what is compiled there belongs to packages,
-    of which there are thousands.
+    Captures and outputs of runs, which hold true frames (`is_foreign`), and what is in no digest
+    (`LEFT_OUT`). The latter stays in a method that ships, and in an environment of Python: what is
+    compiled there belongs to packages. Links are not followed; inside walls they lead nowhere.
     """
-    found, waiting = [], [root]
+    found: list[Path] = []
+    waiting, seen = [(root, not ships)], 0
     while waiting:
-        folder = waiting.pop()
+        folder, strict = waiting.pop()
         entries = _scan(folder)
+        seen += 1
+        if seen > MAX_FOLDERS:
+            raise UsageError(
+                f"holds more than {MAX_FOLDERS} folders, too many to tell what is the method's",
+                where=root,
+                remedy="Keep the method in a folder of its own.",
+            )
         if folder != root and is_foreign(folder, [entry.name for entry in entries]):
+            found.append(folder)
             continue
+        strict = strict and (folder == root or not (folder / _ENVIRONMENT).is_file())
         for path in (Path(e.path) for e in entries if e.is_dir(follow_symlinks=False)):
-            if path.name in LEFT_OUT:
+            if strict and path.name in LEFT_OUT:
                 found.append(path)
-            elif not (path / _ENVIRONMENT).is_file():
-                waiting.append(path)
+            else:
+                waiting.append((path, strict))
     return sorted(found)
 
 

@@ -275,10 +275,10 @@ def read_manifest(path: str | os.PathLike[str]) -> MethodManifest:
         raise BadMethod(f"is larger than {MAX_BYTES} bytes", where=where)
     try:
         text = where.read_text(encoding="utf-8")
-    except (UnicodeDecodeError, OSError) as error:
-        broken = isinstance(error, UnicodeDecodeError)
-        problem = f"is not valid TOML ({error})" if broken else f"cannot be read ({error})"
-        raise BadMethod(problem, where=where) from error
+    except UnicodeDecodeError as error:
+        raise BadMethod(f"is not valid TOML ({error})", where=where) from error
+    except OSError as error:
+        raise BadMethod(f"cannot be read ({error.strerror})", where=where) from error
     value = parse_toml(text, where=where, error=BadMethod)
     fields = without_schema(value, SCHEMA, where=where, error=BadMethod)
     authors = fields.get("authors")

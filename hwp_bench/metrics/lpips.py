@@ -12,14 +12,12 @@ import importlib.util
 import os
 import pickle
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from hwp_bench.base.errors import BadInput, MissingDependency, ShapeMismatch
-from hwp_bench.metrics.pixels import check_same_shape
+from hwp_bench.base.errors import BadInput, MissingDependency
 
 if TYPE_CHECKING:
     import torch
@@ -32,47 +30,32 @@ SCALE = (0.458, 0.448, 0.450)
 EPSILON = 1e-10
 
 
-@dataclass(frozen=True)
-class Convolution:
+class Convolution(NamedTuple):
     """One convolution with its ReLU, as the torchvision checkpoint numbers it."""
 
-    #: Place in `features`: its weights are `features.{index}.weight` and `.bias`.
-    index: int
-    #: Input and output channels, then side of the kernel, stride and padding, px.
-    channels: tuple[int, int]
-    kernel: int
+    #: Number in `features`: its weights are `features.{number}.weight` and `.bias`.
+    number: int
     stride: int
     padding: int
     #: (kernel, stride) of the max pooling before it, if there is one.
-    pool: tuple[int, int] | None = None
+    pool: tuple[int, int] | None
     #: True where LPIPS compares the features after its ReLU.
-    tap: bool = False
-
-
-def _vgg_block(first: int, channels: tuple[int, int], count: int) -> tuple[Convolution, ...]:
-    """`count` 3x3 convolutions; the first changes the channels, the last is compared."""
-    pool = (2, 2) if first > 0 else None
-    head = Convolution(first, channels, 3, 1, 1, pool, tap=count == 1)
-    wide = (channels[1], channels[1])
-    rest = [Convolution(first + 2 * k, wide, 3, 1, 1, tap=k == count - 1) for k in range(1, count)]
-    return (head, *rest)
+    tap: bool
 
 
 #: The convolutional parts of AlexNet (one-column form) and VGG-16.
 BACKBONES: Mapping[str, tuple[Convolution, ...]] = {
     "alex": (
-        Convolution(0, (3, 64), 11, 4, 2, tap=True),
-        Convolution(3, (64, 192), 5, 1, 2, pool=(3, 2), tap=True),
-        Convolution(6, (192, 384), 3, 1, 1, pool=(3, 2), tap=True),
-        Convolution(8, (384, 256), 3, 1, 1, tap=True),
-        Convolution(10, (256, 256), 3, 1, 1, tap=True),
+        Convolution(0, 4, 2, None, True),
+        Convolution(3, 1, 2, (3, 2), True),
+        Convolution(6, 1, 1, (3, 2), True),
+        Convolution(8, 1, 1, None, True),
+        Convolution(10, 1, 1, None, True),
     ),
-    "vgg": (
-        *_vgg_block(0, (3, 64), 2),
-        *_vgg_block(5, (64, 128), 2),
-        *_vgg_block(10, (128, 256), 3),
-        *_vgg_block(17, (256, 512), 3),
-        *_vgg_block(24, (512, 512), 3),
+    # Five blocks; each but the first is pooled before its first convolution.
+    "vgg": tuple(
+        Convolution(k, 1, 1, (2, 2) if k in (5, 10, 17, 24) else None, k in (2, 7, 14, 21, 28))
+        for k in (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)
     ),
 }
 
@@ -91,50 +74,32 @@ class Lpips:
         linear: Mapping[str, torch.Tensor],
     ) -> None:
         self._layers = BACKBONES[net]
-        self._weights: list[tuple[torch.Tensor, torch.Tensor]] = []
-        for layer in self._layers:
-            fan_in, fan_out = layer.channels
-            name = f"features.{layer.index}"
-            shape = (fan_out, fan_in, layer.kernel, layer.kernel)
-            weight = _checked(backbone, f"{name}.weight", shape)
-            bias = _checked(backbone, f"{name}.bias", (fan_out,))
-            self._weights.append((weight, bias))
-        taps = [layer.channels[1] for layer in self._layers if layer.tap]
-        self._linear = [
-            _checked(linear, f"lin{k}.model.1.weight", (1, channels, 1, 1))
-            for k, channels in enumerate(taps)
+        names = [f"features.{layer.number}" for layer in self._layers]
+        self._weights = [
+            (backbone[f"{name}.weight"].float(), backbone[f"{name}.bias"].float()) for name in names
         ]
+        taps = sum(layer.tap for layer in self._layers)
+        self._linear = [linear[f"lin{k}.model.1.weight"].float() for k in range(taps)]
 
     def __call__(self, prediction: np.ndarray, target: np.ndarray) -> float:
-        """LPIPS of two (H, W, 3) float images in [0, 1], sRGB; 0 for identical images."""
+        """LPIPS of two (H, W, 3) float images in [0, 1], sRGB; 0 for identical images.
+
+        Over the compared layers, the sum of the spatial means of the weighted squared differences
+        of unit feature vectors.
+        """
         import torch
 
-        check_same_shape(prediction, target)
         pair = torch.from_numpy(np.stack([prediction, target])).to(torch.float32)
         pair = pair.permute(0, 3, 1, 2) * 2.0 - 1.0
         with torch.inference_mode():
-            return float(self.distance(pair[:1], pair[1:])[0])
-
-    def distance(self, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
-        """LPIPS of image batches.
-
-        Args:
-            x: (B, 3, H, W) float in [-1, 1].
-
-        Returns:
-            (B,): over the compared layers, the sum of the spatial means of the weighted squared
-            differences of unit feature vectors.
-        """
-        if x.shape != y.shape or x.ndim != 4 or x.shape[1] != 3:
-            raise ShapeMismatch(f"LPIPS wants two (B, 3, H, W), not {x.shape} and {y.shape}")
-        if min(x.shape[2:]) < 32:
-            raise ShapeMismatch(f"images of {tuple(x.shape[2:])} are too small for LPIPS")
-        total = x.new_zeros(x.shape[0])
-        features = zip(self._features(x), self._features(y), self._linear, strict=True)
-        for a, b, weight in features:
-            squared = (_unit(a) - _unit(b)) ** 2
-            total = total + (squared * weight).sum(dim=1).mean(dim=(1, 2))
-        return total
+            total = pair.new_zeros(1)
+            features = zip(
+                self._features(pair[:1]), self._features(pair[1:]), self._linear, strict=True
+            )
+            for a, b, weight in features:
+                squared = (_unit(a) - _unit(b)) ** 2
+                total = total + (squared * weight).sum(dim=1).mean(dim=(1, 2))
+            return float(total[0])
 
     def _features(self, image: torch.Tensor) -> list[torch.Tensor]:
         """The compared feature maps of (B, 3, H, W) in [-1, 1]."""
@@ -157,20 +122,6 @@ def _unit(features: torch.Tensor) -> torch.Tensor:
     """Feature vectors (B, C, H, W) brought to length 1 along C."""
     length = features.square().sum(dim=1, keepdim=True).sqrt()
     return features / (length + EPSILON)
-
-
-def _checked(state: Mapping[str, torch.Tensor], name: str, shape: tuple[int, ...]) -> torch.Tensor:
-    """The float32 tensor `name` of `state`, if it has that shape and finite values."""
-    import torch
-
-    tensor = state.get(name)
-    if not isinstance(tensor, torch.Tensor):
-        raise BadInput("the checkpoint lacks this weight", field=name)
-    if tuple(tensor.shape) != shape:
-        raise BadInput(f"has shape {tuple(tensor.shape)}, not {shape}", field=name)
-    if not bool(torch.isfinite(tensor).all()):
-        raise BadInput("holds NaN or infinite values", field=name)
-    return tensor.detach().to(torch.float32)
 
 
 #: File names of the torchvision checkpoints, newest first; the hexadecimal part of the name is

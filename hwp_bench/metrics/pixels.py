@@ -63,18 +63,6 @@ def check_prediction(prediction: np.ndarray, target: np.ndarray) -> None:
         )
 
 
-def check_same_shape(
-    prediction: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None
-) -> None:
-    """Refuse arrays that do not describe one image: two (H, W, 3), and a mask (H, W) or None."""
-    if prediction.shape != target.shape or target.ndim != 3:
-        raise ShapeMismatch(
-            f"prediction and target are {prediction.shape} and {target.shape}, not both (H, W, 3)"
-        )
-    if mask is not None and mask.shape != target.shape[:2]:
-        raise ShapeMismatch(f"the mask is {mask.shape}, the image {target.shape[:2]}", field="mask")
-
-
 @dataclass(frozen=True)
 class Box:
     """A rectangle of pixels; it may reach beyond the frame, where everything is black."""
@@ -220,7 +208,6 @@ def ssim_map(x: np.ndarray, y: np.ndarray, settings: SsimSettings = HWP_V1.ssim)
         (H - 2r, W - 2r) float64 in [-1, 1], mean over channels, r = `settings.radius`; entry
         (0, 0) belongs to the window centred on pixel (r, r).
     """
-    check_same_shape(x, y)
     if min(x.shape[:2]) < settings.size:
         raise ShapeMismatch(f"an image of {x.shape[:2]} is smaller than the window")
     means = [_window_mean(image, settings) for image in (x, y, x * x, y * y, x * y)]
@@ -247,7 +234,6 @@ def ssim_box(
     smaller than the window is grown to its size. Source: protocol paper-wildghand; the oracle in
     the tests is scikit-image's `structural_similarity` with its defaults and a data range of 2.
     """
-    check_same_shape(prediction, target, mask)
     box = bounding_box(mask).at_least(settings.size)
     x, y = (crop(composite(image, mask), box) for image in (prediction, target))
     return float(ssim_map(x, y, settings).mean())
@@ -299,7 +285,6 @@ def oriented_distance(
 
     Source: `docs/protocol.md`; the form follows Zhang et al., CVPR 2018, equation 1.
     """
-    check_same_shape(prediction, target, mask)
     box = bounding_box(mask).grown(padding)
     x, y = (crop(composite(image, mask), box).astype(np.float32) for image in (prediction, target))
     weight = crop(mask, box).astype(np.float32)

@@ -7,7 +7,6 @@ import os
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
@@ -16,8 +15,6 @@ from hwp_bench.base.errors import (
     BadInput,
     BadPrediction,
     BadResult,
-    EmptyMask,
-    HwpError,
     ShapeMismatch,
 )
 from hwp_bench.base.images import as_uint8
@@ -183,8 +180,8 @@ def _lpips(
 class Frame:
     """One frame to score."""
 
-    #: (H, W, 3) uint8, or the error that says why it is missing.
-    prediction: np.ndarray | HwpError
+    #: (H, W, 3) uint8; None where there is no prediction that could be scored.
+    prediction: np.ndarray | None
     #: (H, W, 3) uint8.
     target: np.ndarray
     #: (H, W) uint8 or bool, the data set's own visible-hand mask.
@@ -193,27 +190,24 @@ class Frame:
     coverage: bool = False
 
 
-@dataclass(frozen=True)
-class FrameScore:
-    """The scores of one frame."""
-
-    #: Metric name -> score; the declared penalties where the prediction failed; empty where
-    #: the data set shows no hand to score.
-    values: dict[str, float]
-    #: Why the prediction failed; None where it did not.
-    failure: str | None = None
-
-
 def score_frames(
     frames: Iterable[Frame],
     *,
     networks: Mapping[str, Network] | None = None,
     workers: int | None = None,
-) -> list[FrameScore]:
-    """Score frames in parallel."""
+) -> list[dict[str, float]]:
+    """Score frames in parallel; one without a prediction has the declared penalties."""
+    chosen = networks or {}
+
+    def score(frame: Frame) -> dict[str, float]:
+        if frame.prediction is None:
+            return penalty(chosen)
+        pair = frame.prediction, frame.target, frame.mask
+        return score_frame(*pair, coverage=frame.coverage, networks=chosen)
+
     _keep_freed_memory()
     with ThreadPoolExecutor(workers or os.cpu_count(), thread_name_prefix="score") as pool:
-        return list(pool.map(partial(_score, networks=networks or {}), frames))
+        return list(pool.map(score, frames))
 
 
 def _keep_freed_memory() -> None:
@@ -224,26 +218,6 @@ def _keep_freed_memory() -> None:
     threads wait for each other meanwhile. The block here is never touched, so it costs nothing.
     """
     np.empty(31 * 2**20, np.uint8)
-
-
-def _score(frame: Frame, networks: Mapping[str, Network]) -> FrameScore:
-    check_truth(frame.target, frame.mask)
-    prediction, failure = frame.prediction, None
-    try:
-        if isinstance(prediction, HwpError):
-            raise prediction
-        check_prediction(prediction, frame.target)
-    except HwpError as error:
-        # The mask is still checked: a frame without a hand is not a failure of the method.
-        failure, prediction = str(error), frame.target
-    coverage, asked = frame.coverage, {} if failure else networks
-    try:
-        values = score_frame(
-            prediction, frame.target, frame.mask, coverage=coverage, networks=asked
-        )
-    except EmptyMask:
-        return FrameScore({})
-    return FrameScore(penalty(networks) if failure else values, failure)
 
 
 Scores = dict[str, float]
@@ -297,7 +271,7 @@ class Aggregate:
 
 
 def aggregate(captures: Iterable[CaptureScores]) -> Aggregate:
-    """Average frame scores; nothing is dropped, and NaN and infinity are refused.
+    """Average frame scores; nothing is dropped.
 
     Sums are exact before they are rounded once (`math.fsum`), so the order of captures and frames
     never changes a digit.
@@ -358,7 +332,3 @@ def _check(captures: Sequence[CaptureScores]) -> None:
                 odd = ", ".join(sorted(set(row) ^ metrics)) or "none at all"
                 problem = f"its metrics differ from the other frames' ({odd})"
                 raise BadResult(problem, where=capture.id, field=place)
-            for name, score in row.items():
-                if not math.isfinite(score):
-                    problem = f"the score is {score}"
-                    raise BadResult(problem, where=capture.id, field=f"{place}.{name}")

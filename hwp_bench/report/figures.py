@@ -21,16 +21,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from markupsafe import Markup
 
-from hwp_bench.analysis.bootstrap import Estimate
+from hwp_bench.analysis.bootstrap import Estimate, bootstrap_mean
 from hwp_bench.analysis.cost import CostAnalysis
 from hwp_bench.analysis.curves import FrontPart, MeanCurve
+from hwp_bench.analysis.pairing import MethodRuns, scopes
 from hwp_bench.base.files import atomic_write
 from hwp_bench.base.tables import write_tables
 from hwp_bench.capture.schema import CaptureInfo
 from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.report.sources import TemporalWeights
 from hwp_bench.results import CaptureResult
-from hwp_bench.taxonomy import MAX_SEVERITY, perturbation
+from hwp_bench.taxonomy import MAX_SEVERITY, PERTURBATIONS, perturbation
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -238,6 +239,21 @@ def _draw_front(
             seconds, scores, color=PALETTE["front"], linewidth=9, solid_capstyle="round",
             label="Pareto front" if index == 0 else None, gid=f"{MARK}front",
         )  # fmt: skip
+
+
+def bars_by_perturbation(runs: Sequence[MethodRuns], metric: str) -> Markup | None:
+    """Draw the mean of each method and perturbation; None where no capture has one."""
+    groups = {}
+    for name, weights in scopes(runs[0].first).items():
+        if name in PERTURBATIONS:
+            samples = [[run.values(c, metric, sorted(run.seeds)) for c in weights] for run in runs]
+            groups[perturbation(name).heading] = [
+                bootstrap_mean(own, list(weights.values()), resamples=2000) for own in samples
+            ]
+    if not groups:
+        return None
+    title = f"{metric_facts(metric).label} by perturbation with 95 % intervals"
+    return inline_svg(draw_bars(groups, metric), title)
 
 
 def draw_bars(groups: Mapping[str, Sequence[Estimate]], metric: str) -> Figure:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import base64
 import os
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from importlib import resources
@@ -12,11 +10,8 @@ from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-import cv2
-import numpy as np
 from markupsafe import Markup
 
-from hwp_bench.analysis.bootstrap import bootstrap_mean
 from hwp_bench.analysis.compare import (
     compare,
     differences_table,
@@ -25,22 +20,27 @@ from hwp_bench.analysis.compare import (
     standings_table,
 )
 from hwp_bench.analysis.cost import PLAIN, CostAnalysis, analyse_cost
-from hwp_bench.analysis.pairing import MethodRuns, group_runs, refuse_unlike, scopes
-from hwp_bench.base.arrays import evenly
-from hwp_bench.base.drawing import fitted, labelled, sheet
-from hwp_bench.base.errors import BadResult, HwpError, UsageError
+from hwp_bench.analysis.pairing import MethodRuns, group_runs, refuse_unlike
+from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import atomic_write
-from hwp_bench.base.images import read_rgb
 from hwp_bench.base.tables import Table
 from hwp_bench.capture.schema import CaptureInfo
 from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.report.figures import (
     StripMethod,
-    draw_bars,
+    bars_by_perturbation,
     draw_pareto,
     inline_svg,
     series_classes,
     strip_plot,
+)
+from hwp_bench.report.pictures import (
+    MAX_BYTES,
+    Album,
+    AvatarPages,
+    copy_avatar_pages,
+    mask_sheet,
+    read_picture,
 )
 from hwp_bench.report.sources import (
     ResultsSource,
@@ -59,7 +59,7 @@ from hwp_bench.report.study_tables import (
 from hwp_bench.report.tables import all_tables, free_view_table, same_data
 from hwp_bench.results import Results
 from hwp_bench.results.schema import add_isolation_note
-from hwp_bench.taxonomy import PERTURBATIONS, perturbation
+from hwp_bench.taxonomy import perturbation
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -152,102 +152,6 @@ def provenance(result: Results) -> dict[str, str]:
     }
 
 
-#: Name of a page within `captures/ID/` of a results folder.
-AVATAR_PAGE = "avatar.html"
-#: Largest page, bytes.
-MAX_PAGE_BYTES = 32 << 20
-
-#: Addresses by number of the result and id of the capture.
-AvatarPages = dict[tuple[int, str], str]
-
-
-def copy_avatar_pages(folder: Path, sources: Sequence[ResultsSource]) -> AvatarPages:
-    """Copy pages of avatars next to a report."""
-    found: AvatarPages = {}
-    for index, source in enumerate(sources):
-        for number, capture in enumerate(source.results.captures):
-            path = source.place(capture.id, AVATAR_PAGE)
-            if path is None or not path.exists():
-                continue
-            address = f"avatars/{index}-{number}.html"
-            atomic_write(folder / address, _read(path))
-            found[index, capture.id] = address
-    return found
-
-
-def _read(path: Path) -> str:
-    if path.is_symlink() or not path.is_file() or path.stat().st_size > MAX_PAGE_BYTES:
-        raise BadResult(f"must be a file of at most {MAX_PAGE_BYTES >> 20} MiB", where=path)
-    try:
-        text = path.read_text("utf-8")
-    except UnicodeDecodeError:
-        text = ""
-    if not text.lstrip()[:15].lower().startswith("<!doctype html"):
-        raise BadResult("is not an HTML page", where=path, remedy="Make it with `wildghand page`.")
-    return text
-
-
-#: Largest sum of the images in a page, bytes in base64.
-MAX_BYTES = 8 * 1024 * 1024
-#: Quality of the JPEGs: the sheets are for looking, the results keep the exact pixels.
-QUALITY = 82
-#: Larger edge of an image in the page, px.
-EDGE = 1056
-#: Weight masks shown of one capture, and their larger edge, px.
-MASKS, MASK_EDGE = 6, 160
-
-
-class Album:
-    """Turns images into data URIs until the budget of bytes (`left`) is spent."""
-
-    def __init__(self, budget: int = MAX_BYTES) -> None:
-        self.left = budget
-        #: How many images the budget did not allow.
-        self.left_out = 0
-
-    def take(self, pixels: np.ndarray | None) -> str | None:
-        """Return a (H, W, 3) uint8 image as a data URI; None without one, or beyond the budget."""
-        if pixels is None:
-            return None
-        if max(pixels.shape[:2]) > EDGE:
-            pixels = fitted(pixels, EDGE)
-        done, data = cv2.imencode(
-            ".jpg", np.ascontiguousarray(pixels[:, :, ::-1]), [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
-        )
-        uri = "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode()
-        if not done or len(uri) > self.left:
-            self.left_out += 1
-            return None
-        self.left -= len(uri)
-        return uri
-
-
-def mask_sheet(source: ResultsSource, capture: str, album: Album) -> tuple[str, int] | None:
-    """Return a sheet of a method's weight masks and how many there are, or None.
-
-    At most `MASKS` are shown, spread evenly over the frames.
-    """
-    folder = source.place(capture, "diagnostics", "weights")
-    if folder is None or not folder.is_dir():
-        return None
-    files = sorted(path for path in folder.iterdir() if re.fullmatch(r"\d{6}\.png", path.name))
-    shown = [files[index] for index in evenly(len(files), MASKS)] if files else []
-    read = [(path, pixels) for path in shown if (pixels := _read_picture(path)) is not None]
-    tiles = [labelled(fitted(pixels, MASK_EDGE), f"frame {int(p.stem)}") for p, pixels in read]
-    uri = album.take(sheet(tiles, columns=3)) if tiles else None
-    return (uri, len(files)) if uri else None
-
-
-def _read_picture(path: Path | None) -> np.ndarray | None:
-    """Return (H, W, 3) uint8; None where the file is missing or not an image."""
-    if path is None or not path.is_file():
-        return None
-    try:
-        return read_rgb(path)
-    except HwpError:
-        return None
-
-
 #: The metric of the plots and of the summary sentence.
 HEADLINE = "psnr"
 
@@ -297,7 +201,7 @@ def gather_report(
         "tables": noted(shown),
         "pareto": _pareto(cost, runs) if cost else None,
         "cost_tables": noted(cost.tables.values() if cost else ()),
-        "bars": _bars(runs),
+        "bars": bars_by_perturbation(runs, HEADLINE),
         "differences": noted(_optional(lambda: _differences(runs)) or ()),
         "captures": _captures(chosen, runs, infos, album, sources, avatar_pages or {}),
         "provenance": [provenance(result) for result in results],
@@ -354,23 +258,6 @@ def _pareto(cost: CostAnalysis, runs: Sequence[MethodRuns]) -> Markup:
     return inline_svg(figure, f"{metric_facts(HEADLINE).label} over seconds of fitting")
 
 
-def _bars(runs: Sequence[MethodRuns]) -> Markup | None:
-    """Draw the mean of each method and perturbation; None where no capture has one."""
-    groups = {}
-    for name, weights in scopes(runs[0].first).items():
-        if name in PERTURBATIONS:
-            samples = [
-                [run.values(c, HEADLINE, sorted(run.seeds)) for c in weights] for run in runs
-            ]
-            groups[perturbation(name).heading] = [
-                bootstrap_mean(own, list(weights.values()), resamples=2000) for own in samples
-            ]
-    if not groups:
-        return None
-    title = f"{metric_facts(HEADLINE).label} by perturbation with 95 % intervals"
-    return inline_svg(draw_bars(groups, HEADLINE), title)
-
-
 def _differences(runs: Sequence[MethodRuns]) -> list[Table]:
     if len(runs) < 2:
         return []
@@ -406,7 +293,7 @@ def _captures(
             weights = sound_temporal_weights(source, capture.id)
             methods.append(StripMethod(len(methods), label, own, weights))
             for name, file in (("frames", "comparison.png"), ("views", "free_view.png")):
-                picture = _read_picture(source.place(capture.id, "pictures", file))
+                picture = read_picture(source.place(capture.id, "pictures", file))
                 if uri := album.take(picture):
                     found[name].append((label, uri))
             if masks := mask_sheet(source, capture.id, album):

@@ -27,6 +27,9 @@ DISTANCE = "oriented_distance"
 #: For each variant, by its title: component title -> True where the variant has it.
 Marks = Mapping[str, Mapping[str, bool]]
 
+#: The cells of a row.
+Row = tuple[Cell, ...]
+
 _PERTURBED = {name: perturbation(name).heading for name in PERTURBATIONS}
 _ELSEWHERE = {"interhand2.6m": "InterHand2.6M (Inter.)", "anchorcrafter": "AnchorCrafter (Inter.)"}
 
@@ -76,15 +79,14 @@ def fact_table(number: int) -> Table:
     names = [perturbation(name).title for name in PERTURBATIONS]
     keys = ("clean_test", "single", "interacting", *PERTURBATIONS)
     heads = ["Data set", "Environment", "Clean test", "Single", "Interacting", *names]
-    notes: tuple[str, ...]
-    caption, notes = "Hand video data sets", (f"Published in {published.title}, table 1.",)
-    rows = [
+    caption, notes = "Hand video data sets", [f"Published in {published.title}, table 1."]
+    rows: list[Row] = [
         (item.name, item.environment, *_ticks(key in item.has for key in keys))
         for item in published.datasets
     ]
     if number == 2:
         heads = ["Capture", "Hand", "Action", "Device", "Frames", *names]
-        caption, notes = "The captures of the HWP data set", ()
+        caption, notes = "The captures of the HWP data set", []
         rows = [
             (
                 *(entry.id, entry.hands, entry.action, entry.device, str(entry.frame_count)),
@@ -92,15 +94,11 @@ def fact_table(number: int) -> Table:
             )
             for entry in catalogue().values()
         ]
-    return Table(caption, tuple(map(Column, heads)), tuple(rows), notes)
+    return Table(caption, tuple(map(Column, heads)), tuple(rows), tuple(notes))
 
 
 def _ticks(present: Iterable[bool]) -> list[str]:
     return ["✓" if here else "" for here in present]
-
-
-#: The cells of a row.
-Row = tuple[Cell, ...]
 
 
 def _layout(

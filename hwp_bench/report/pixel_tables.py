@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
+from hwp_bench.analysis.columns import Filled, block_breaks, table_of
 from hwp_bench.base.console import track
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.images import read_rgb
-from hwp_bench.base.tables import Cell, Column, Table
+from hwp_bench.base.tables import Column, Table
 from hwp_bench.capture import Capture
 from hwp_bench.capture.splits import Split, split_for
 from hwp_bench.hands.anchors import Footprint, HandSurfaces
@@ -28,7 +30,6 @@ from hwp_bench.metrics.pixels import (
 from hwp_bench.metrics.protocol import HWP_V1
 from hwp_bench.report.sources import ResultsSource, stored_predictions
 from hwp_bench.report.tables import labels
-from hwp_bench.results import CaptureResult
 
 #: Edge of a cell, m.
 PATCH = 0.004
@@ -109,8 +110,7 @@ UNCERTAIN = 2
 _RIM = np.ones((3, 3), np.uint8)
 
 
-@dataclass(frozen=True)
-class OutlineScores:
+class OutlineScores(NamedTuple):
     """One frame, by what its prediction draws outside of the hand."""
 
     #: PSNR of the headline protocol, dB.
@@ -209,41 +209,32 @@ def novelty_table(sources: Sequence[ResultsSource], captures: Mapping[str, Captu
             field="--captures",
             remedy="Name the capture folders, and results folders that hold predictions.",
         )
-    columns = (
-        Column("What is new"),
-        Column("Class"),
-        Column("Method"),
-        Column("Pixels [%]", 1),
-        Column("Of the error [%]", 1),
-        Column("PSNR [dB]", 2, True),
-    )
     half = len(_ANGLE_NAMES) + 1
-    rows: list[tuple[Cell, ...]] = []
-    breaks = []
     titles = labels([source.results for source in sources])
-    for index, (what, name) in enumerate(CLASSES):
+    shown = []
+    for index, named in enumerate(CLASSES):
         block = slice(0, half) if index < half else slice(half, None)
-        breaks.append(len(rows))
         for title, (pixels, errors) in zip(titles, totals, strict=True):
-            if not pixels[index]:
-                continue
-            rows.append(
-                (
-                    what,
-                    name,
-                    title,
-                    float(100.0 * pixels[index] / pixels[block].sum()),
-                    float(100.0 * errors[index] / max(errors[block].sum(), 1e-12)),
-                    decibels(errors[index] / pixels[index]),
-                )
-            )
+            if pixels[index]:
+                share = float(100.0 * pixels[index] / pixels[block].sum())
+                part = float(100.0 * errors[index] / max(errors[block].sum(), 1e-12))
+                psnr = decibels(errors[index] / pixels[index])
+                shown.append((named, title, share, part, psnr))
+    keys, methods, shares, parts, scores = zip(*shown, strict=True)
+    columns: list[Filled] = [
+        (Column("What is new"), [what for what, _ in keys]),
+        (Column("Class"), [name for _, name in keys]),
+        (Column("Method"), methods),
+        (Column("Pixels [%]", 1), shares),
+        (Column("Of the error [%]", 1), parts),
+        (Column("PSNR [dB]", 2, True), scores),
+    ]
     notes = (
         "Classes of the scored pixels of all test frames; the squared error is pooled in each.",
         "Angle: between a pixel's normal and the nearest normal of the same 4 mm place in a "
         "training frame. Seen: share of the training frames whose mask shows the place.",
     )
-    inner = tuple(place for place in dict.fromkeys(breaks) if 0 < place < len(rows))
-    return Table("By novelty", columns, tuple(rows), notes, breaks=inner)
+    return table_of("By novelty", columns, notes, breaks=block_breaks(keys))
 
 
 def _pooled(
@@ -259,7 +250,12 @@ def _pooled(
         runs = []
         for source, total in zip(sources, totals, strict=True):
             for item in source.on(digest):
-                _check_split(item, split)
+                if split.digest != item.split_digest:
+                    raise UsageError(
+                        "was not split by the 80/10/10 rule; novelty needs its training frames",
+                        where=item.id,
+                        field="RESULTS",
+                    )
                 runs.append((stored_predictions(source, item), total))
         frames = sorted({frame for files, _ in runs for frame in files})
         if not frames:
@@ -278,16 +274,6 @@ def _pooled(
                     np.add.at(pixels, index, 1.0)
                     np.add.at(errors, index, error)
     return totals
-
-
-def _check_split(item: CaptureResult, split: Split) -> None:
-    """Refuse a split whose training frames are not known here."""
-    if split.digest != item.split_digest:
-        raise UsageError(
-            "was not split by the 80/10/10 rule; novelty needs its training frames",
-            where=item.id,
-            field="RESULTS",
-        )
 
 
 def classes_of(novelty: Novelty, region: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -325,8 +311,7 @@ def outline_table(sources: Sequence[ResultsSource], captures: Mapping[str, Captu
     """
     found: list[list[OutlineScores]] = [[] for _ in sources]
     for digest, capture in track(captures.items(), "Outlines", len(captures)):
-        means = _means(sources, digest, capture)
-        if means:
+        if means := _means(sources, digest, capture):
             for scores, mean in zip(found, means, strict=True):
                 scores.append(mean)
     if not found or not found[0]:
@@ -335,20 +320,15 @@ def outline_table(sources: Sequence[ResultsSource], captures: Mapping[str, Captu
             field="--captures",
             remedy="Name the capture folders, and results folders that hold predictions.",
         )
-    columns = (
-        Column("Method"),
-        Column("PSNR [dB]", 2, True),
-        Column("Drawn outside [%]", 1, False),
-        Column("With the outside [dB]", 2, True),
-        Column("If spread [dB]", 2),
-    )
-    rows: list[tuple[Cell, ...]] = []
-    titles = labels([source.results for source in sources])
-    for title, scores in zip(titles, found, strict=True):
-        mean = _mean(scores)
-        outside = 100.0 * mean.drawn_outside
-        rows.append((title, mean.psnr, outside, mean.psnr_with_outside, mean.psnr_spread))
-    return Table("By outline", columns, tuple(rows), _NOTES)
+    means = [_mean(scores) for scores in found]
+    columns: list[Filled] = [
+        (Column("Method"), labels([source.results for source in sources])),
+        (Column("PSNR [dB]", 2, True), [mean.psnr for mean in means]),
+        (Column("Drawn outside [%]", 1, False), [100.0 * mean.drawn_outside for mean in means]),
+        (Column("With the outside [dB]", 2, True), [mean.psnr_with_outside for mean in means]),
+        (Column("If spread [dB]", 2), [mean.psnr_spread for mean in means]),
+    ]
+    return table_of("By outline", columns, _NOTES)
 
 
 def _means(sources: Sequence[ResultsSource], digest: str, capture: Capture) -> list[OutlineScores]:
@@ -378,9 +358,4 @@ def _means(sources: Sequence[ResultsSource], digest: str, capture: Capture) -> l
 
 
 def _mean(scores: Sequence[OutlineScores]) -> OutlineScores:
-    return OutlineScores(
-        psnr=fmean(one.psnr for one in scores),
-        drawn_outside=fmean(one.drawn_outside for one in scores),
-        psnr_with_outside=fmean(one.psnr_with_outside for one in scores),
-        psnr_spread=fmean(one.psnr_spread for one in scores),
-    )
+    return OutlineScores(*map(fmean, zip(*scores, strict=True)))

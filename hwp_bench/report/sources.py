@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import glob
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
+from string import ascii_uppercase
 from typing import Annotated
 
 import numpy as np
@@ -85,14 +87,9 @@ def stored_predictions(source: ResultsSource, item: CaptureResult) -> dict[int, 
     folder = source.place(item.id, "predictions")
     if folder is None:
         return {}
-    files = {
-        frame.frame: folder / frame_name(frame.frame)
-        for frame in item.frames
-        if frame.failure is None
-    }
-    return {
-        frame: path for frame, path in files.items() if path.is_file() and not path.is_symlink()
-    }
+    sound = [frame.frame for frame in item.frames if frame.failure is None]
+    files = {frame: folder / frame_name(frame) for frame in sound}
+    return {frame: f for frame, f in files.items() if f.is_file() and not f.is_symlink()}
 
 
 def temporal_weights(source: ResultsSource, capture: str) -> dict[str, TemporalWeights]:
@@ -134,10 +131,8 @@ def sound_temporal_weights(source: ResultsSource, capture: str) -> dict[str, Tem
 
 def mean_temporal_weight(source: ResultsSource, capture: str) -> float | None:
     """Return the mean temporal weight over sides and frames, or None where none was left."""
-    found = sound_temporal_weights(source, capture)
-    if not found:
-        return None
-    return float(np.mean([np.mean(item.weights) for item in found.values()]))
+    found = sound_temporal_weights(source, capture).values()
+    return float(np.mean([np.mean(item.weights) for item in found])) if found else None
 
 
 def find_captures(
@@ -163,7 +158,9 @@ def _located(
     places = [Path(folder) for folder in folders]
     rendered = cache_root() / "sim" / "captures"
     for identifier in sorted(set(digests.values())):
-        places += sorted(rendered.glob(f"{_literal(identifier)}-*"))
+        # A name from outside matches itself and nothing else.
+        name = glob.escape(identifier.replace("/", "_"))
+        places += sorted(rendered.glob(f"{name}-*"))
     found = {}
     for place in places:
         path = place / "capture.json"
@@ -175,11 +172,6 @@ def _located(
         if digest in digests:
             found[digest] = (info, place)
     return found
-
-
-def _literal(text: str) -> str:
-    """Return a glob pattern that matches a name from outside and nothing else."""
-    return "".join(f"[{char}]" if char in "*?[" else char for char in text.replace("/", "_"))
 
 
 def mean_severity(
@@ -218,10 +210,11 @@ def data_groups(sources: Sequence[ResultsSource], *, oracles: bool = False) -> l
     found: dict[str, list[ResultsSource]] = {}
     for source in sources:
         found.setdefault(data_key(source.results, oracles=oracles), []).append(source)
-    several = len(found) > 1
+    # `A` to `Z`, then `A1`, `B1`, ...
+    letters = [f"{ascii_uppercase[k % 26]}{k // 26 or ''}" for k in range(len(found))]
     return [
-        DataGroup(_label(place) if several else "", _text(group[0].results), tuple(group))
-        for place, group in enumerate(found.values())
+        DataGroup(label if len(found) > 1 else "", _text(group[0].results), tuple(group))
+        for label, group in zip(letters, found.values(), strict=True)
     ]
 
 
@@ -232,11 +225,6 @@ def data_key(results: Results, *, oracles: bool = False) -> str:
         for c in results.captures
     )
     return sha256_json([captures, results.protocols, None if oracles else results.frames])
-
-
-def _label(place: int) -> str:
-    """Return `A` to `Z`, then `A1`, `B1`, ..."""
-    return chr(ord("A") + place % 26) + (str(place // 26) if place >= 26 else "")
 
 
 def _text(results: Results) -> str:
@@ -270,23 +258,18 @@ def stacked(groups: Sequence[DataGroup], tables: Sequence[Table]) -> Table:
         unranked |= {start + place for place in table.unranked}
         # A table that ranks nothing keeps its rows out of the ranks.
         unranked |= set() if table.ranked else set(range(start, start + len(table.rows)))
-        places = [_place(table.columns, column) for column in columns]
-        rows += [
-            (group.label, *(None if place is None else row[place] for place in places))
-            for row in table.rows
-        ]
+        for row in table.rows:
+            cells = {(c.group, c.title): cell for c, cell in zip(table.columns, row, strict=True)}
+            rows.append((group.label, *(cells.get((c.group, c.title)) for c in columns)))
     notes = ["Results are on different data: only rows of the same data are ranked together."]
     notes += [f"{HEADING} {group.label}: {group.text}." for group in groups]
     notes += _importer_notes(groups)
-    seen = [
-        (group.label, note)
-        for group, table in zip(groups, tables, strict=True)
-        for note in table.notes
-    ]
-    for note in dict.fromkeys(note for _, note in seen):
-        owners = [label for label, text in seen if text == note]
-        said_by_all = len(owners) == len(groups)
-        notes.append(note if said_by_all else f"{', '.join(owners)}: {note}")
+    owners: dict[str, list[str]] = {}
+    for group, table in zip(groups, tables, strict=True):
+        for note in table.notes:
+            owners.setdefault(note, []).append(group.label)
+    for note, labels in owners.items():
+        notes.append(note if len(labels) == len(groups) else f"{', '.join(labels)}: {note}")
     return Table(
         tables[0].caption,
         (Column(HEADING), *columns),
@@ -312,21 +295,14 @@ def _importer_notes(groups: Sequence[DataGroup]) -> list[str]:
     ]
 
 
-def _joined(every: Sequence[Sequence[Column]]) -> list[Column]:
+def _joined(every: Iterable[Iterable[Column]]) -> list[Column]:
     """Return the columns of several tables, those of a group next to each other."""
-    found: list[Column] = []
+    found: dict[tuple[str, str], Column] = {}
     for columns in every:
         for column in columns:
-            if _place(found, column) is not None:
-                continue
-            kin = [i for i, c in enumerate(found) if column.group and c.group == column.group]
-            found.insert(kin[-1] + 1 if kin else len(found), replace(column))
-    return found
-
-
-def _place(columns: Sequence[Column], wanted: Column) -> int | None:
-    """Return where the column of that group and title is."""
-    for place, column in enumerate(columns):
-        if (column.group, column.title) == (wanted.group, wanted.title):
-            return place
-    return None
+            found.setdefault((column.group, column.title), column)
+    # Groups in the order of their first column; a column without a group is one by itself.
+    groups: dict[object, list[Column]] = {}
+    for key, column in found.items():
+        groups.setdefault(column.group or key, []).append(column)
+    return [column for own in groups.values() for column in own]

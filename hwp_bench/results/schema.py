@@ -198,8 +198,7 @@ class Results:
     seed: Seed
     #: Limits of the fit: `seconds`, `steps`, either may be None.
     budget: Limits
-    #: Training frames that the method was given: `perturbed`, or an oracle's choice. The oldest
-    #: files do not say it: there was nothing to choose.
+    #: Training frames that the method was given: `perturbed`, or an oracle's choice.
     frames: Line = field(default="perturbed", kw_only=True)
     #: Settings of every protocol that was scored, by name.
     protocols: FreeTable

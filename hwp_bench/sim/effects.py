@@ -1,16 +1,16 @@
 """The four perturbations: settings, what each changes in a frame's recipe, and that recipe.
 
-An effect is a set of hooks, each of which changes one part of the recipe. Effects compose in the
-order of `ORDER`: pose, objects, light, shutter. A hook is only asked in frames where its effect
-acts, so that every other frame is the same with and without it.
+An effect is its settings and hooks, each of which changes one part of the recipe. Effects compose
+in the order of `ORDER`: pose, objects, light, shutter. A hook is only asked in frames where its
+effect acts, so that every other frame is the same with and without it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import Annotated, Any, ClassVar, Literal, TypeVar
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from msgspec import Meta
@@ -19,12 +19,17 @@ from hwp_bench.base.colors import lamp_color
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.records import number, parse_record
 from hwp_bench.sim.geometry.noise import generator
-from hwp_bench.sim.geometry.surface import unit
-from hwp_bench.sim.light.lights import CastShadow, Lights, focus_point, steady_light
+from hwp_bench.sim.geometry.surface import rigid, unit
+from hwp_bench.sim.light.lights import CastShadow, Lights, steady_light
 from hwp_bench.sim.props.objects import check_object
-from hwp_bench.sim.scene.motion import (
+from hwp_bench.sim.scene.scene import (
+    EffectCall,
+    Episode,
+    HandKey,
     HandMoment,
+    Scene,
     along_keys,
+    by_side,
     envelope,
     intrinsics,
     level,
@@ -33,7 +38,6 @@ from hwp_bench.sim.scene.motion import (
     severity,
     track_moment,
 )
-from hwp_bench.sim.scene.scene import EffectCall, Episode, HandKey, Scene, by_side
 from hwp_bench.sim.sensor import sensor_passes
 from hwp_bench.sim.subject.subject import Words
 
@@ -44,8 +48,6 @@ _Degrees = Annotated[float, Meta(ge=-360.0, le=360.0)]
 _Spin = Annotated[float, Meta(ge=-3600.0, le=3600.0)]
 _LightMode = Literal["dim", "bright", "warm", "cool", "move", "flicker", "shadow"]
 _ZERO = (0.0, 0.0, 0.0)
-
-Settings = TypeVar("Settings")
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,12 +79,10 @@ class Shutter:
 
 
 class Effect:
-    """Base of every effect: hooks that do nothing."""
+    """An effect: its fields are the settings of its `effects` table, its hooks do nothing."""
 
     #: Name in scenes and captures.
     name: ClassVar[str]
-    #: The fields of its `effects` table after its episodes.
-    settings: ClassVar[type]
     #: Names of the passes that a frame needs because the effect acts in it.
     passes: ClassVar[tuple[str, ...]] = ()
     #: Strengths for severity 1 to 5 where the scene has no calibration.
@@ -90,80 +90,50 @@ class Effect:
     #: Largest strength that makes sense.
     max_strength: ClassVar[float]
     #: How far off an estimator is at strength 1: standard deviations in rad and m.
-    estimate_errors: ClassVar[tuple[float, float]] = (0.0, 0.0)
+    estimate_errors: ClassVar[tuple[float, float]]
 
-    def stage(
+    def named_hands(self) -> Iterator[tuple[str, str]]:
+        """The hands that the settings name, each with the field that does."""
+        return iter(())
+
+    def pose_hands(
         self, scene: Scene, call: EffectCall, seconds: float, hands: dict[str, HandMoment]
     ) -> dict[str, HandMoment]:
         """Change what the hands do."""
         return hands
 
-    def objects(
-        self, scene: Scene, call: EffectCall, seconds: float, strength: float
-    ) -> tuple[Placement, ...]:
+    def place_objects(self, scene: Scene, seconds: float, strength: float) -> list[Placement]:
         """Bring objects into the frame."""
-        return ()
+        return []
 
-    def light(
+    def change_light(
         self, scene: Scene, call: EffectCall, seconds: float, strength: float, lights: Lights
     ) -> Lights:
         """Change the light or the exposure."""
         return lights
 
-    def shutter(
-        self, scene: Scene, call: EffectCall, seconds: float, strength: float
-    ) -> Shutter | None:
+    def open_shutter(self, scene: Scene, seconds: float, strength: float) -> Shutter | None:
         """Open the shutter long enough to see motion."""
         return None
 
-    def estimate_error(self, strength: float) -> tuple[float, float]:
+    @classmethod
+    def estimate_error(cls, strength: float) -> tuple[float, float]:
         """How far off an estimator is: standard deviations in rad and m."""
-        angle, length = self.estimate_errors
+        angle, length = cls.estimate_errors
         return angle * strength, length * strength
 
 
-def read_settings(kind: type[Settings], call: EffectCall, where: str) -> Settings:
-    """The settings of an effect as the dataclass of its kind."""
-    return parse_record(kind, call.settings, where=where, field=_path(call), error=BadInput)
-
-
-def check_settings(call: EffectCall, sides: tuple[str, ...], where: str) -> None:
-    """Refuse settings of an effect that are at fault, or that name a hand the scene lacks."""
-    settings: Any = read_settings(registered(call.kind).settings, call, where)
-    path = _path(call)
-    if isinstance(settings, ComplexPoses):
-        check_sides(by_side(settings), sides, path, where)
-    elif isinstance(settings, ObjectInteraction):
-        check_sides(by_side(settings.stage), sides, f"{path}.stage", where)
-        for index, item in enumerate(settings.items):
-            if item.anchor not in (*sides, "world", None):
-                raise BadInput(
-                    f"is {item.anchor!r}",
-                    where=where,
-                    field=f"{path}.items[{index}].anchor",
-                    remedy=f"Known: {', '.join((*sides, 'world'))}.",
-                )
-
-
-def check_sides(found: Mapping[str, Any], sides: tuple[str, ...], path: str, where: str) -> None:
-    """Refuse a table with an entry for a hand that the scene does not show."""
-    for side in found:
-        if side not in sides:
-            raise BadInput(
-                f"the scene does not show the {side} hand", where=where, field=f"{path}.{side}"
-            )
-
-
-def _path(call: EffectCall) -> str:
-    return f"effects({call.kind})"
-
-
-# Complex poses: fast articulation and extreme angles, where an estimator errs more.
-
-
 @dataclass(frozen=True)
-class ComplexPoses:
-    """Settings of `complex_poses`; a side without keys keeps its track."""
+class ComplexPoses(Effect):
+    """Fast articulation and extreme angles, where an estimator errs more.
+
+    A side without keys keeps its track. Strength is the error of the estimated joint angles, rad.
+    """
+
+    name = "complex_poses"
+    default_strengths = (0.02, 0.035, 0.055, 0.085, 0.13)
+    max_strength = 0.2
+    estimate_errors = (1.0, 0.04)
 
     #: Keys per second.
     pace: float = number(1.6, 0.1, 10.0)
@@ -176,31 +146,22 @@ class ComplexPoses:
         if not self.right and not self.left:
             raise UsageError("holds no key", field="right or left")
 
+    def named_hands(self) -> Iterator[tuple[str, str]]:
+        """The hands with keys, or that objects move with."""
+        return ((side, side) for side in by_side(self))
 
-class _ComplexPoses(Effect):
-    name = "complex_poses"
-    settings = ComplexPoses
-    #: Error of the estimated joint angles, rad.
-    default_strengths = (0.02, 0.035, 0.055, 0.085, 0.13)
-    max_strength = 0.2
-    estimate_errors = (1.0, 0.04)
-
-    def stage(
+    def pose_hands(
         self, scene: Scene, call: EffectCall, seconds: float, hands: dict[str, HandMoment]
     ) -> dict[str, HandMoment]:
-        settings = read_settings(ComplexPoses, call, scene.id)
+        """Blend from the track to the keys."""
         weight = envelope(call, seconds / scene.duration)
         changed = dict(hands)
-        for side, rows in by_side(settings).items():
+        for side, rows in by_side(self).items():
             if rows:
                 row = [moment_of_key(key) for key in rows]
-                label = f"complex-{side}"
-                goal = along_keys(row, seconds * settings.pace, scene, label, 8.0)
+                goal = along_keys(row, seconds * self.pace, scene, f"complex-{side}", 8.0)
                 changed[side] = hands[side].blend(goal, weight)
         return changed
-
-
-# Hand-object interaction: objects that the hands hold, touch or pass, that cover and shade them.
 
 
 @dataclass(frozen=True)
@@ -231,6 +192,20 @@ class ObjectItem:
     def __post_init__(self) -> None:
         check_object(self.object)
 
+    def transform(self, seconds: float, strength: float) -> np.ndarray:
+        """(4, 4) from the object to its anchor at a time."""
+        from scipy.spatial.transform import Rotation
+
+        wave = np.sin(2.0 * np.pi * self.pace * seconds + np.array([0.0, 0.6, 1.2]))
+        angles = np.array(self.rotate) + np.array(self.spin) * seconds
+        turn = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
+        away = (1.0 - strength) * np.array(self.away)
+        # Objects keep their front: +z of an object faces the camera, its top is up.
+        return rigid(
+            turn @ np.diag([1.0, -1.0, -1.0]),
+            np.array(self.place) + away + wave * np.array(self.swing),
+        )
+
 
 @dataclass(frozen=True)
 class StagedHands:
@@ -243,8 +218,17 @@ class StagedHands:
 
 
 @dataclass(frozen=True)
-class ObjectInteraction:
-    """Settings of `hand_object_interaction`."""
+class ObjectInteraction(Effect):
+    """Objects that the hands hold, touch or pass, that cover and shade them.
+
+    Strength 0 leaves the objects where they come from, 1 brings them to their place.
+    """
+
+    name = "hand_object_interaction"
+    passes = ("objects",)
+    default_strengths = (0.25, 0.45, 0.65, 0.85, 1.0)
+    max_strength = 1.0
+    estimate_errors = (0.06, 0.003)
 
     #: The objects, at least one.
     items: tuple[ObjectItem, ...] = ()
@@ -255,64 +239,56 @@ class ObjectInteraction:
         if not self.items:
             raise UsageError("names no object", field="items")
 
+    def named_hands(self) -> Iterator[tuple[str, str]]:
+        """The hands with keys, or that objects move with."""
+        yield from ((f"stage.{side}", side) for side in by_side(self.stage))
+        for index, item in enumerate(self.items):
+            if item.anchor not in ("world", None):
+                yield f"items[{index}].anchor", item.anchor
 
-class _HandObjectInteraction(Effect):
-    name = "hand_object_interaction"
-    settings = ObjectInteraction
-    passes = ("objects",)
-    #: 0 leaves the objects where they come from, 1 brings them to their place.
-    default_strengths = (0.25, 0.45, 0.65, 0.85, 1.0)
-    max_strength = 1.0
-    estimate_errors = (0.06, 0.003)
-
-    def stage(
+    def pose_hands(
         self, scene: Scene, call: EffectCall, seconds: float, hands: dict[str, HandMoment]
     ) -> dict[str, HandMoment]:
-        settings = read_settings(ObjectInteraction, call, scene.id)
+        """Blend from the track to the keys."""
         weight = envelope(call, seconds / scene.duration)
         changed = dict(hands)
-        for side, key in by_side(settings.stage).items():
-            goal = moment_of_key(key)
+        for side, key in by_side(self.stage).items():
+            goal, track = moment_of_key(key), hands[side]
             # The wander of the track goes on, so that a staged hand is not frozen.
             goal = HandMoment(
-                goal.angles + 0.15 * (hands[side].angles - goal.angles),
-                goal.place + 0.1 * (hands[side].place - goal.place),
-                goal.heading + 0.06 * (hands[side].heading - goal.heading),
+                goal.angles + 0.15 * (track.angles - goal.angles),
+                goal.place + 0.1 * (track.place - goal.place),
+                goal.heading + 0.06 * (track.heading - goal.heading),
             )
-            changed[side] = hands[side].blend(goal, weight)
+            changed[side] = track.blend(goal, weight)
         return changed
 
-    def objects(
-        self, scene: Scene, call: EffectCall, seconds: float, strength: float
-    ) -> tuple[Placement, ...]:
-        from scipy.spatial.transform import Rotation
-
-        # Objects keep their front: +z of an object faces the camera, its top is up.
-        flip = np.diag([1.0, -1.0, -1.0])
-        placements = []
-        for item in read_settings(ObjectInteraction, call, scene.id).items:
-            if strength < item.above:
-                continue
-            wave = np.sin(2.0 * np.pi * item.pace * seconds + np.array([0.0, 0.6, 1.2]))
-            transform = np.eye(4)
-            angles = np.array(item.rotate) + np.array(item.spin) * seconds
-            transform[:3, :3] = Rotation.from_euler("xyz", angles, degrees=True).as_matrix() @ flip
-            transform[:3, 3] = (
-                np.array(item.place)
-                + (1.0 - strength) * np.array(item.away)
-                + wave * np.array(item.swing)
+    def place_objects(self, scene: Scene, seconds: float, strength: float) -> list[Placement]:
+        """Place the objects."""
+        return [
+            Placement(
+                item.object,
+                item.variant,
+                item.anchor or scene.sides[0],
+                item.transform(seconds, strength),
             )
-            anchor = item.anchor or scene.sides[0]
-            placements.append(Placement(item.object, item.variant, anchor, transform))
-        return tuple(placements)
-
-
-# Illumination: exposure, colour temperature, direction of the lamps, flicker, a passing shadow.
+            for item in self.items
+            if strength >= item.above
+        ]
 
 
 @dataclass(frozen=True)
-class Illumination:
-    """Settings of `illumination`."""
+class Illumination(Effect):
+    """Exposure, colour temperature, direction of the lamps, flicker, a passing shadow.
+
+    Strength 1 halves or doubles the exposure, or does its equal in colour or direction.
+    """
+
+    name = "illumination"
+    passes = ("light",)
+    default_strengths = (0.15, 0.3, 0.5, 0.8, 1.2)
+    max_strength = 2.5
+    estimate_errors = (0.004, 0.0005)
 
     #: What the episodes do to the light, in turn.
     modes: tuple[_LightMode, ...] = ("dim", "warm", "move", "bright", "cool", "shadow")
@@ -321,23 +297,13 @@ class Illumination:
         if not self.modes:
             raise UsageError("is empty", field="modes")
 
-
-class _Illumination(Effect):
-    name = "illumination"
-    settings = Illumination
-    passes = ("light",)
-    #: 1 halves or doubles the exposure, or its equal in colour or direction.
-    default_strengths = (0.15, 0.3, 0.5, 0.8, 1.2)
-    max_strength = 2.5
-    estimate_errors = (0.004, 0.0005)
-
-    def light(
+    def change_light(
         self, scene: Scene, call: EffectCall, seconds: float, strength: float, lights: Lights
     ) -> Lights:
-        modes = read_settings(Illumination, call, scene.id).modes
+        """Change the light as the mode of the episode says."""
         moment = seconds / scene.duration
         number = next((i for i, e in enumerate(call.episodes) if e.start <= moment <= e.end), 0)
-        mode = modes[number % len(modes)]
+        mode = self.modes[number % len(self.modes)]
         if mode in ("dim", "bright"):
             stops = -1.0 if mode == "dim" else 0.7
             return replace(lights, exposure=lights.exposure * 2.0 ** (stops * strength))
@@ -346,8 +312,7 @@ class _Illumination(Effect):
             return replace(lights, exposure=lights.exposure * 2.0 ** (strength * (wave - 0.4)))
         if mode in ("warm", "cool"):
             kelvin = 5500.0 * 2.0 ** ((-0.8 if mode == "warm" else 0.9) * strength)
-            tint = lamp_color(kelvin) / lamp_color(5500.0)
-            return lights.tinted(tint)
+            return lights.tinted(lamp_color(kelvin) / lamp_color(5500.0))
         if mode == "shadow":
             return replace(lights, cast=_passing_shadow(call.episodes[number], moment, strength))
         return _moved(lights, strength)
@@ -370,73 +335,65 @@ def _moved(lights: Lights, strength: float) -> Lights:
 
     swing = Rotation.from_euler("y", 70.0 * strength, degrees=True)
     direction = swing.apply(lights.direction) + np.array([0.0, 0.25 * strength, 0.0])
-    turn, focus = swing.as_matrix(), focus_point()
-    lamps = tuple(lamp.turned(turn, focus) for lamp in lights.lamps)
+    lamps = tuple(lamp.turned(swing.as_matrix()) for lamp in lights.lamps)
     return replace(lights, direction=unit(direction), lamps=lamps)
 
 
-# Motion blur: hands or camera that move while the shutter is open.
-
-
 @dataclass(frozen=True)
-class MotionBlur:
-    """Settings of `motion_blur`."""
+class MotionBlur(Effect):
+    """Hands or camera that move while the shutter is open.
+
+    Strength is the length of the streak, as a fraction of the image's width.
+    """
+
+    name = "motion_blur"
+    passes = ("shutter",)
+    default_strengths = (0.008, 0.018, 0.034, 0.06, 0.1)
+    max_strength = 0.25
+    estimate_errors = (0.5, 0.04)
 
     #: How long the shutter is open, s.
     shutter: float = number(0.02, 0.001, 0.5)
     #: Way of the whole image, as a share of the hands' way.
     camera_share: float = number(0.0, 0.0, 1.0)
 
-
-class _MotionBlur(Effect):
-    name = "motion_blur"
-    settings = MotionBlur
-    passes = ("shutter",)
-    #: Length of the streak, fraction of the image's width.
-    default_strengths = (0.008, 0.018, 0.034, 0.06, 0.1)
-    max_strength = 0.25
-    estimate_errors = (0.5, 0.04)
-
-    def shutter(
-        self, scene: Scene, call: EffectCall, seconds: float, strength: float
-    ) -> Shutter | None:
-        settings = read_settings(MotionBlur, call, scene.id)
-        angle = _slow_angle(scene, seconds)
-        way = strength * np.array([np.cos(angle), np.sin(angle)])
-        camera = (
-            settings.camera_share
-            * strength
-            * np.array([np.cos(1.7 * angle + 1.0), np.sin(1.7 * angle + 1.0)])
-        )
+    def open_shutter(self, scene: Scene, seconds: float, strength: float) -> Shutter | None:
+        """Shake hands and camera."""
+        # The direction of the shaking turns a few times a second.
+        rates = generator(scene.seed, "shake").uniform(1.0, 3.0, 2)
+        angle = float(np.pi * np.sin(rates[0] * seconds) + 2.0 * np.sin(rates[1] * seconds + 1.0))
+        shaken, share = 1.7 * angle + 1.0, self.camera_share * strength
         return Shutter(
-            seconds=settings.shutter,
-            hand=(float(way[0]), float(way[1])),
-            camera=(float(camera[0]), float(camera[1])),
+            seconds=self.shutter,
+            hand=(float(strength * np.cos(angle)), float(strength * np.sin(angle))),
+            camera=(float(share * np.cos(shaken)), float(share * np.sin(shaken))),
             twist=150.0 * strength * float(np.sin(2.3 * angle)),
         )
 
 
-def _slow_angle(scene: Scene, seconds: float) -> float:
-    """Direction of the shaking, which turns a few times a second."""
-    rates = generator(scene.seed, "shake").uniform(1.0, 3.0, 2)
-    return float(np.pi * np.sin(rates[0] * seconds) + 2.0 * np.sin(rates[1] * seconds + 1.0))
-
-
 #: The effects by name, in the order in which they act on a frame.
-EFFECTS: Mapping[str, Effect] = MappingProxyType(
-    {
-        effect.name: effect
-        for effect in (_ComplexPoses(), _HandObjectInteraction(), _Illumination(), _MotionBlur())
-    }
+EFFECTS: Mapping[str, type[Effect]] = MappingProxyType(
+    {effect.name: effect for effect in (ComplexPoses, ObjectInteraction, Illumination, MotionBlur)}
 )
 ORDER = tuple(EFFECTS)
 
 
-def registered(kind: str) -> Effect:
-    """Return the effect of a name."""
-    if kind not in EFFECTS:
-        raise BadInput(f"there is no effect {kind!r}", remedy=f"Known: {', '.join(ORDER)}.")
-    return EFFECTS[kind]
+def read_effect(call: EffectCall, where: str) -> Effect:
+    """The effect of a call with its settings."""
+    path = f"effects({call.kind})"
+    return parse_record(EFFECTS[call.kind], call.settings, where=where, field=path, error=BadInput)
+
+
+def check_hands(found: Iterable[tuple[str, str]], scene: Scene, path: str, where: str) -> None:
+    """Refuse a field that names a hand which the scene does not show."""
+    for name, side in found:
+        if side not in scene.sides:
+            raise BadInput(
+                f"the scene does not show the {side} hand",
+                where=where,
+                field=f"{path}.{name}",
+                remedy=f"It shows: {', '.join(scene.sides)}.",
+            )
 
 
 #: Longest way between two sub-frames, in pixels.
@@ -488,9 +445,10 @@ def plan_frame(
         if level(call, moment)
     }
     shutter = None
-    if "motion_blur" in acting:
-        call = _call(scene, "motion_blur")
-        shutter = registered("motion_blur").shutter(scene, call, seconds, acting["motion_blur"])
+    for call in scene.effects:
+        if call.kind in acting:
+            effect = read_effect(call, scene.id)
+            shutter = effect.open_shutter(scene, seconds, acting[call.kind]) or shutter
     subframes = 1
     if shutter is not None:
         way = _screen_way(scene, seconds, shutter, size)
@@ -501,9 +459,7 @@ def plan_frame(
     passes += [*scene.subject.looks.passes, *scene.behind.passes]
     passes += ["lamps"] if scene.light.lamps else []
     passes += ["room"] if scene.light.room is not None else []
-    for kind in ORDER:
-        if kind in acting:
-            passes += registered(kind).passes
+    passes += [name for kind in ORDER if kind in acting for name in EFFECTS[kind].passes]
     passes += sensor_passes(scene.sensor)
     return FramePlan(
         frame=frame,
@@ -520,34 +476,35 @@ def plan_frame(
 def hands_at(scene: Scene, seconds: float) -> dict[str, HandMoment]:
     """The hands at a time, with the effects on their pose."""
     hands = {side: track_moment(scene, side, seconds) for side in scene.sides}
-    moment = seconds / scene.duration
     for kind in ORDER:
         call = scene.effect(kind)
-        if call is not None and level(call, moment):
-            hands = registered(kind).stage(scene, call, seconds, hands)
+        if call is not None and level(call, seconds / scene.duration):
+            hands = read_effect(call, scene.id).pose_hands(scene, call, seconds, hands)
     return hands
 
 
-def objects_at(scene: Scene, recipe: FramePlan, seconds: float) -> tuple[Placement, ...]:
+def objects_at(scene: Scene, recipe: FramePlan, seconds: float) -> list[Placement]:
     """The objects of a frame at a time within its shutter."""
-    placements: tuple[Placement, ...] = ()
-    for kind, strength in recipe.strength.items():
-        placements += registered(kind).objects(scene, _call(scene, kind), seconds, strength)
-    return placements
+    return [
+        placement
+        for call, strength in _acting(scene, recipe)
+        for placement in read_effect(call, scene.id).place_objects(scene, seconds, strength)
+    ]
 
 
 def lights_at(scene: Scene, recipe: FramePlan) -> Lights:
     """The light of a frame."""
     lights = steady_light(scene.light)
-    for kind, strength in recipe.strength.items():
-        lights = registered(kind).light(scene, _call(scene, kind), recipe.seconds, strength, lights)
+    for call, strength in _acting(scene, recipe):
+        effect = read_effect(call, scene.id)
+        lights = effect.change_light(scene, call, recipe.seconds, strength, lights)
     return lights
 
 
-def _call(scene: Scene, kind: str) -> EffectCall:
-    call = scene.effect(kind)
-    assert call is not None
-    return call
+def _acting(scene: Scene, recipe: FramePlan) -> Iterator[tuple[EffectCall, float]]:
+    """The effects that act in a frame, each with its strength."""
+    calls = (call for call in scene.effects if call.kind in recipe.strength)
+    return ((call, recipe.strength[call.kind]) for call in calls)
 
 
 def _screen_way(scene: Scene, seconds: float, shutter: Shutter, size: int) -> float:
@@ -568,11 +525,7 @@ def _screen_way(scene: Scene, seconds: float, shutter: Shutter, size: int) -> fl
 
 
 def _strength_at(call: EffectCall, level: float) -> float:
-    """Strength at a level from 0 (absent) to 5, interpolated between severities.
-
-    Strengths at severity 1 to 5 are the scene's own where it was calibrated
-    (`hwp-bench sim calibrate`), else the effect's.
-    """
-    strengths = call.strengths or registered(call.kind).default_strengths
+    """Strength at a level from 0 (absent) to 5, interpolated between severities."""
+    strengths = call.strengths or EFFECTS[call.kind].default_strengths
     table = (0.0, *strengths)
     return float(np.interp(level, np.arange(len(table)), table))

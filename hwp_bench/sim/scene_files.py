@@ -12,10 +12,16 @@ from msgspec import Meta
 
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.records import MAX_CHARACTERS, parse_record, parse_toml
-from hwp_bench.sim.effects import check_settings, check_sides
-from hwp_bench.sim.props.backdrops import check_backdrop
-from hwp_bench.sim.scene.motion import clean_share
-from hwp_bench.sim.scene.scene import CLEAN_FROM, MIN_CLEAN_SHARE, EffectCall, Episode, Scene
+from hwp_bench.sim.effects import check_hands, read_effect
+from hwp_bench.sim.props.behind import check_backdrop
+from hwp_bench.sim.scene.scene import (
+    CLEAN_FROM,
+    MIN_CLEAN_SHARE,
+    EffectCall,
+    Episode,
+    Scene,
+    clean_share,
+)
 from hwp_bench.sim.sensor import Sensor
 from hwp_bench.sim.subject.subject import Words
 from hwp_bench.taxonomy import MAX_SEVERITY, PERTURBATIONS
@@ -45,9 +51,9 @@ def scene_groups() -> tuple[str, ...]:
 
 
 def scene_path(name: str) -> Path:
-    """Path of the file of a scene that comes with the package; of one of a group too."""
-    group = next((group for group in scene_groups() if name in scene_names(group)), "")
-    return _SCENES / group / f"{name}.toml"
+    """Path of the file of a scene that comes with the package."""
+    (path,) = (*_SCENES.glob(f"{name}.toml"), *_SCENES.glob(f"*/{name}.toml"))
+    return path
 
 
 def known_scenes() -> tuple[str, ...]:
@@ -101,12 +107,8 @@ def _shipped_scene(name: str) -> Scene:
 def parse_scene(text: str, *, where: str) -> Scene:
     """Make a scene of TOML text."""
     content = parse_toml(text, where=where)
-    effects = parse_record(
-        _Effects,
-        {name: content.pop(name) for name in ("effects",) if name in content},
-        where=where,
-        error=BadInput,
-    )
+    rows = {name: content.pop(name) for name in ("effects",) if name in content}
+    effects = parse_record(_Effects, rows, where=where, error=BadInput)
     noise = {name: content.pop(name) for name in ("noise",) if name in content}
     scene = parse_record(Scene, content, where=where, error=BadInput)
     calls = tuple(_effect(row, f"effects[{i}]", where) for i, row in enumerate(effects.effects))
@@ -117,7 +119,7 @@ def parse_scene(text: str, *, where: str) -> Scene:
         scene = replace(scene, sensor=sensor)
     elif noise:
         raise BadInput("is in the table sensor already", where=where, field="noise")
-    check_sides(scene.track.keys, scene.sides, "track", where)
+    check_hands(((side, side) for side in scene.track.keys), scene, "track", where)
     for side in scene.sides:
         if not scene.track.keys.get(side):
             raise BadInput("holds no key", where=where, field=f"track.{side}")
@@ -158,11 +160,10 @@ class _EffectTable:
                 raise UsageError(
                     f"severity {severity} is not in 1..{MAX_SEVERITY}", field="episodes"
                 )
-        values = self.strengths or (0.0,)
-        if values[0] < 0.0 or sorted(values) != list(values):
-            raise UsageError(
-                f"is {list(values)}, expected rising numbers from 0 up", field="strengths"
-            )
+        values = list(self.strengths or ())
+        if sorted(values) != values:
+            problem = f"is {values}, expected rising numbers from 0 up"
+            raise UsageError(problem, field="strengths")
 
 
 def _effect(row: dict[str, Any], path: str, where: str) -> EffectCall:
@@ -182,7 +183,8 @@ def _check_effects(scene: Scene, where: str) -> None:
     if len(set(kinds)) != len(kinds):
         raise BadInput("an effect is called twice", where=where, field="effects")
     for call in scene.effects:
-        check_settings(call, scene.sides, where)
+        named = read_effect(call, where).named_hands()
+        check_hands(named, scene, f"effects({call.kind})", where)
     share = clean_share(scene)
     if share < MIN_CLEAN_SHARE:
         raise BadInput(

@@ -84,10 +84,7 @@ def sensor_passes(sensor: Sensor) -> tuple[str, ...]:
 def record(
     sensor: Sensor, seed: int, frame: int, colors: tuple[np.ndarray, ...]
 ) -> tuple[np.ndarray, ...]:
-    """Add noise to the light that is counted, (S, S, 3) linear, of a frame and its clean version.
-
-    The noise of both is the same; it follows from the scene's seed and the frame's number.
-    """
+    """Add the same noise to the light that is counted, (S, S, 3) linear, of each version."""
     if not sensor.noise:
         return colors
     rng = generator(seed, "sensor", frame)
@@ -112,11 +109,7 @@ def store(sensor: Sensor, image: np.ndarray) -> np.ndarray:
 
 
 def sharpened(image: np.ndarray, strength: float) -> np.ndarray:
-    """Unsharp mask on the luma, as a phone applies it after the tone curve.
-
-    Takes `image` (H, W, 3) uint8 sRGB. Returns (H, W, 3) uint8; colours keep their differences from
-    the luma.
-    """
+    """Unsharp mask on the luma, as a phone applies it after the tone curve: (H, W, 3) uint8."""
     import cv2
 
     luma = image.astype(np.float32) @ np.array(LUMA, dtype=np.float32)
@@ -139,10 +132,7 @@ def check_encoder(where: str) -> None:
 def through_h264(
     frames: Iterable[np.ndarray], bits_per_pixel: float, fps: float, where: str
 ) -> Iterator[np.ndarray]:
-    """Encode a clip and decode it again.
-
-    Takes `frames` (H, W, 3) uint8 sRGB. Yields (H, W, 3) uint8 sRGB for each frame.
-    """
+    """Encode a clip of (H, W, 3) uint8 sRGB frames and decode it again."""
     av = _library(where)
     try:
         yield from _coded(av, iter(frames), bits_per_pixel, fps)

@@ -24,7 +24,7 @@ from hwp_bench.run.worker import load_entry
 training = open_request(Path(sys.argv[1]))
 found = {}
 for folder in map(Path, sys.argv[2:]):
-    settings = {**read_manifest(folder).presets["default"], "device": "cpu", "gaussians": 400}
+    settings = {**read_manifest(folder).presets["smoke"], "device": "cpu", "gaussians": 400}
     method = load_entry(folder, read_manifest(folder).entry.python)(settings, 0)
     before = set(sys.modules)
     method.fit(training, Budget(steps=1), SilentReport())

@@ -23,7 +23,7 @@ from painted import (
 
 from hwp_bench.hands import pose_hand
 from hwp_bench.hands.skeleton import HandParameters
-from hwp_bench.sim.geometry.rays import Tracer
+from hwp_bench.sim.geometry.surface import Tracer
 from plain_fit.method import PlainMethod
 from shadow_albedo_fit.method import ShadowedModel, ShadowMethod, lamp_cameras, visibility
 from wildghand.gaussians.quaternions import quat_third_axis

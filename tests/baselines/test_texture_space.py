@@ -18,7 +18,7 @@ from hwp_bench.capture import Capture
 from hwp_bench.hands import load_template
 from hwp_bench.hands.anchors import sample_surface
 from hwp_bench.methods.contract import TrainingCapture
-from hwp_bench.sim.produce.suites import suite, suite_names
+from hwp_bench.sim.produce.capture import suite, suite_names
 from hwp_bench.sim.scene_files import load_scene
 from plain_fit.method import PlainMethod
 from texture_space_fit.method import (

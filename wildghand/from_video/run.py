@@ -29,9 +29,10 @@ from hwp_bench.base.console import StagesView, notice
 from hwp_bench.base.errors import BadCapture, BadInput
 from hwp_bench.base.files import read_json, write_json
 from hwp_bench.base.records import Seconds, merged, parse_record
-from hwp_bench.capture.schema import check_id
+from hwp_bench.capture.schema import METADATA, check_id
 from hwp_bench.importers.shared.output import CHOICES, check_choices
 from hwp_bench.importers.video import FitSettings
+from wildghand.avatar.files import DESCRIPTION
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
 from wildghand.fitting.session import Watch
 from wildghand.model.settings import nested
@@ -118,7 +119,10 @@ class Job:
         self.record = self.work / "stages.json"
         self.landmarks = options.landmarks or self.work / "landmarks.npz"
         self.capture = self.work / "capture"
+        self.metadata = self.capture / METADATA
         self.fitted = self.work / "avatar"
+        self.fit = self.fitted / DESCRIPTION
+        self.avatar = folder / DESCRIPTION
         self.turntable = folder / "turntable.mp4"
         self.sheet = folder / "sheet.jpg"
         self.page = folder / "avatar.html"
@@ -150,6 +154,8 @@ class Stage(ABC):
     title: str
     #: Whether all processes run it, or the first one only.
     together = False
+    #: Name of the job's file that says that its result is there.
+    makes = ""
 
     @abstractmethod
     def facts(self, job: Job) -> dict[str, str]:
@@ -158,9 +164,10 @@ class Stage(ABC):
         The stages before it have ended when this is called.
         """
 
-    @abstractmethod
     def result(self, job: Job) -> Path:
-        """The file or folder that says that its result is there."""
+        """The file or folder that says that its result is there; else the job's, by its name."""
+        place: Path = getattr(job, self.makes)
+        return place
 
     @abstractmethod
     def run(self, job: Job) -> None:

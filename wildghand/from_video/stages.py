@@ -102,12 +102,11 @@ def avatar_digest(folder: Path) -> str:
 class _Picture(Stage):
     """A stage that shows the avatar; its version rises when the picture comes out otherwise."""
 
-    def facts(self, job: Job) -> dict[str, str]:
-        return {"avatar": avatar_digest(job.folder), f"look of the {self.name}": self.look()}
+    #: Everything that the picture depends on, besides the avatar.
+    look: str
 
-    def look(self) -> str:
-        """Everything that the picture depends on, besides the avatar."""
-        raise NotImplementedError
+    def facts(self, job: Job) -> dict[str, str]:
+        return {"avatar": avatar_digest(job.folder), f"look of the {self.name}": self.look}
 
     def run(self, job: Job) -> None:
         self.show(job, load_avatar(job.folder, hand=job.options.hand_model))
@@ -120,13 +119,8 @@ class _Picture(Stage):
 class DrawTurntable(_Picture):
     """The avatar from all around, as it stands in its studio."""
 
-    name, title = "turntable", "Drawing the turntable"
-
-    def look(self) -> str:
-        return str((2, SIZE, FRAMES, FPS, BACKGROUND))
-
-    def result(self, job: Job) -> Path:
-        return job.turntable
+    name, title, makes = "turntable", "Drawing the turntable", "turntable"
+    look = str((2, SIZE, FRAMES, FPS, BACKGROUND))
 
     def show(self, job: Job, avatar: WildGHandAvatar) -> None:
         table = Turntable(avatar, SIZE)
@@ -140,13 +134,8 @@ class DrawTurntable(_Picture):
 class DrawSheet(_Picture):
     """The contact sheet: frames, the avatar in their poses, its weights, and all of its sides."""
 
-    name, title = "sheet", "Drawing the contact sheet"
-
-    def look(self) -> str:
-        return str((1, COLUMNS, EDGE))
-
-    def result(self, job: Job) -> Path:
-        return job.sheet
+    name, title, makes = "sheet", "Drawing the contact sheet", "sheet"
+    look = str((1, COLUMNS, EDGE))
 
     def show(self, job: Job, avatar: WildGHandAvatar) -> None:
         drawn = avatar_sheet(avatar, open_capture(job.capture), job.folder / WEIGHTS)
@@ -159,13 +148,8 @@ class DrawSheet(_Picture):
 class WritePage(_Picture):
     """The avatar's page: one file that turns and poses it in a browser."""
 
-    name, title = "page", "Writing the page"
-
-    def look(self) -> str:
-        return "1"
-
-    def result(self, job: Job) -> Path:
-        return job.page
+    name, title, makes = "page", "Writing the page", "page"
+    look = "1"
 
     def show(self, job: Job, avatar: WildGHandAvatar) -> None:
         write_page(avatar, job.page, capture=open_capture(job.capture), overwrite=True)
@@ -186,7 +170,7 @@ def _frame_count(job: Job) -> int:
 class Track(Stage):
     """The landmarks of the hands in the video; nothing where a person gives them."""
 
-    name, title = "track", "Tracking the hand"
+    name, title, makes = "track", "Tracking the hand", "landmarks"
 
     def facts(self, job: Job) -> dict[str, str]:
         given, model = job.options.landmarks, job.options.tracker
@@ -195,9 +179,6 @@ class Track(Stage):
             return {"landmarks": sha256_of(given)}
         tracker = "shipped" if model is None else str(model)
         return {"video": sha256_of(job.video), "tracker": tracker}
-
-    def result(self, job: Job) -> Path:
-        return job.landmarks
 
     def run(self, job: Job) -> None:
         if job.options.landmarks is not None:
@@ -226,7 +207,7 @@ class Track(Stage):
 class Import(Stage):
     """Frames, masks, hand parameters and cameras of the video."""
 
-    name, title = "import", "Importing the hand"
+    name, title, makes = "import", "Importing the hand", "metadata"
 
     def facts(self, job: Job) -> dict[str, str]:
         return {
@@ -238,9 +219,6 @@ class Import(Stage):
             "settings of the import": canonical_json(asdict(job.options.importer)),
             "version of the importer": str(IMPORTER_VERSION),
         }
-
-    def result(self, job: Job) -> Path:
-        return job.capture / "capture.json"
 
     def run(self, job: Job) -> None:
         import_video(job.video, job.landmarks, job.capture, import_options(job))
@@ -297,7 +275,7 @@ def import_options(job: Job) -> VideoImport:
 class Fit(Stage):
     """The avatar, fitted to the capture."""
 
-    name, title, together = "fit", "Fitting the avatar", True
+    name, title, makes, together = "fit", "Fitting the avatar", "fit", True
 
     def facts(self, job: Job) -> dict[str, str]:
         options = job.options
@@ -309,9 +287,6 @@ class Fit(Stage):
             "seed": str(options.seed),
             "choice of frames": "all" if options.all_frames else "split",
         }
-
-    def result(self, job: Job) -> Path:
-        return job.fitted / DESCRIPTION
 
     def run(self, job: Job) -> None:
         options = job.options
@@ -342,13 +317,10 @@ class Fit(Stage):
 class Place(Stage):
     """The avatar in its folder; its description comes last and makes it one."""
 
-    name, title = "place", "Placing the avatar"
+    name, title, makes = "place", "Placing the avatar", "avatar"
 
     def facts(self, job: Job) -> dict[str, str]:
         return {"avatar": avatar_digest(job.fitted)}
-
-    def result(self, job: Job) -> Path:
-        return job.folder / DESCRIPTION
 
     def run(self, job: Job) -> None:
         try:

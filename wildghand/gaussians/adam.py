@@ -46,24 +46,24 @@ class ClippedAdam(torch.optim.Adam):
                 parameter.grad = None
 
     def take_step(self, loss: Tensor) -> None:
-        """Move everything that has a gradient.
+        """Move everything that has a gradient; nothing changes where one or the loss is not finite.
 
-        Nothing changes where the loss or a gradient is not finite. Nobody waits to learn whether
-        they are: torch's fused kernels read that where it lies, as for a `GradScaler`, and skip the
-        step.
+        Nobody waits to learn whether it is: torch's fused kernels read that where it lies, as for a
+        `GradScaler`, and skip the step.
         """
         gradients = []
         for group in self.param_groups:
             for parameter in group["params"]:
                 _lay_out_alike(parameter)
-                if parameter.grad is not None:
+                if parameter.grad is not None and parameter.grad.numel():
                     gradients.append(parameter.grad)
-        sizes = torch.stack(torch._foreach_norm(gradients, math.inf))
-        finite = loss.detach().isfinite() & sizes.isfinite().all()
+        finite = loss.detach().isfinite()
+        if gradients:
+            finite = finite & torch.stack(torch._foreach_norm(gradients, math.inf)).isfinite().all()
+        self.found_inf = (~finite).float()
         if self.limit > 0.0:
             clipped = [group["params"] for group in self.param_groups if group.get("clipped", True)]
             torch.nn.utils.clip_grad_norm_([p for some in clipped for p in some], self.limit)
-        self.found_inf = (~finite).float()
         self.step()
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:

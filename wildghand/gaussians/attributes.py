@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from types import MappingProxyType
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -143,24 +144,24 @@ class AnchoredGaussians:
     """
 
     #: (N, 3) m, from the anchor, in its frame.
-    offsets: torch.Tensor
+    offsets: Tensor
     #: (N, 3) natural logarithms of the standard deviations in m.
-    log_scales: torch.Tensor
+    log_scales: Tensor
     #: (N, 4) orientation in the anchor's frame, (w, x, y, z), any length but 0.
-    quats: torch.Tensor
+    quats: Tensor
     #: (N,) opacity before the sigmoid.
-    logit_opacities: torch.Tensor
+    logit_opacities: Tensor
     #: (N, 3) sRGB colour before the sigmoid.
-    logit_colors: torch.Tensor
+    logit_colors: Tensor
 
     def __len__(self) -> int:
         return len(self.offsets)
 
-    def parameters(self) -> dict[str, torch.Tensor]:
+    def parameters(self) -> dict[str, Tensor]:
         """The tensors by name, in a fixed order."""
         return {item.name: getattr(self, item.name) for item in fields(self)}
 
-    def place(self, positions: torch.Tensor, orientations: torch.Tensor) -> PlacedGaussians:
+    def place(self, positions: Tensor, orientations: Tensor) -> PlacedGaussians:
         """Carry the Gaussians into B frames, without their colours.
 
         `positions` are (B, N, 3) m, `orientations` (B, N, 4) unit quaternions, both of the anchors.
@@ -180,23 +181,18 @@ class AnchoredGaussians:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class PlacedGaussians:
-    """Gaussians in B frames, in the shapes that `wildghand.splat.rasterize` takes."""
+class PlacedGaussians(NamedTuple):
+    """Gaussians in B frames, in the order and shapes that `wildghand.splat.rasterize` takes."""
 
-    #: (B, N, 3) m, world.
-    means: torch.Tensor
-    #: (B, N, 4) of length 1, world.
-    quats: torch.Tensor
-    #: (N, 3) m.
-    scales: torch.Tensor
-    #: (N,) in (0, 1).
-    opacities: torch.Tensor
+    means: Tensor  # (B, N, 3) m, world
+    quats: Tensor  # (B, N, 4) of length 1, world
+    scales: Tensor  # (N, 3) m
+    opacities: Tensor  # (N,) in (0, 1)
 
 
 def flat_gaussians(
-    spacing: torch.Tensor,
-    colors: torch.Tensor,
+    spacing: Tensor,
+    colors: Tensor,
     *,
     opacity: float,
     width: float = 0.6,

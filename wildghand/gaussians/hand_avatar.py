@@ -109,4 +109,4 @@ class DrawnAvatar(HandAvatar):
         steps: int,
     ) -> None:
         super().__init__(sides, device, steps)
-        self.draw = draw  # type: ignore[method-assign,assignment]
+        self.draw = draw  # type: ignore[method-assign, assignment]

@@ -24,12 +24,14 @@ from wildghand.splat.kernels.jit import inline, jobs, kernel
 from wildghand.splat.kernels.vectors import (
     Vector,
     absolute,
+    add_lines,
     bits,
     fma,
     make_fill,
     make_load,
     select,
     store,
+    store_lines,
 )
 from wildghand.splat.threads import kernels_take, run_jobs
 
@@ -138,11 +140,7 @@ def _sum_moments(images, image, row, first, last, window, blurred):
             u, v, weight = _load(images.x, at), _load(images.y, at), window[k - row + _HALF]
             wu, wv = u * weight, v * weight
             x, y, xx, yy, xy = x + wu, y + wv, fma(wu, u, xx), fma(wv, v, yy), fma(wu, v, xy)
-        store(blurred, pad + j, x)
-        store(blurred, stride + pad + j, y)
-        store(blurred, 2 * stride + pad + j, xx)
-        store(blurred, 3 * stride + pad + j, yy)
-        store(blurred, 4 * stride + pad + j, xy)
+        store_lines(blurred, pad + j, stride, (x, y, xx, yy, xy))
     _clear_ends(blurred, pad, first, last)
 
 
@@ -163,14 +161,10 @@ def _compare_row(images, at, first, last, channels, constants, blurred, spread, 
     share = _ONE - dssim_weight
     for place in range(first, last, LANES):
         j = min(place, last - LANES)
-        x, y, xx, yy, xy = _fill(_ZERO), _fill(_ZERO), _fill(_ZERO), _fill(_ZERO), _fill(_ZERO)
+        sums = (_fill(_ZERO), _fill(_ZERO), _fill(_ZERO), _fill(_ZERO), _fill(_ZERO))
         for k in range(WINDOW):
-            i, weight = j + k * channels, window[k]
-            x = fma(_load(blurred, i), weight, x)
-            y = fma(_load(blurred, stride + i), weight, y)
-            xx = fma(_load(blurred, 2 * stride + i), weight, xx)
-            yy = fma(_load(blurred, 3 * stride + i), weight, yy)
-            xy = fma(_load(blurred, 4 * stride + i), weight, xy)
+            sums = add_lines(blurred, j + k * channels, stride, window[k], sums)
+        x, y, xx, yy, xy = sums
         product, squares = x * y, x * x + y * y
         a1 = product * _TWO + c1
         a2 = (xy - product) * _TWO + c2
@@ -190,9 +184,8 @@ def _compare_row(images, at, first, last, channels, constants, blurred, spread, 
         scale = weight_of * dssim_weight
         share1, share2 = b2 * inverse, b1 * inverse
         of_mean = (x * ssim * (share1 - share2) - y * (a2 - a1) * inverse) * _TWO
-        store(made.factors, at + j, scale * of_mean)
-        store(made.factors, plane + at + j, scale * ssim * share2)
-        store(made.factors, 2 * plane + at + j, scale * (a1 * inverse) * (-_TWO))
+        factors = (scale * of_mean, scale * ssim * share2, scale * (a1 * inverse) * (-_TWO))
+        store_lines(made.factors, at + j, plane, factors)
 
 
 @kernel
@@ -254,25 +247,20 @@ def gather(worker, counters, ends, images, channels, window, made, gradient):
             continue
         for place in range(first, last, LANES):
             j = min(place, last - LANES)
-            f0, f1, f2 = _fill(_ZERO), _fill(_ZERO), _fill(_ZERO)
+            sums = (_fill(_ZERO), _fill(_ZERO), _fill(_ZERO))
             for k in range(start, stop):
-                at, weight = (image * height + k) * size + j, window[k - row + _HALF]
-                f0 = fma(_load(made.factors, at), weight, f0)
-                f1 = fma(_load(made.factors, plane + at), weight, f1)
-                f2 = fma(_load(made.factors, 2 * plane + at), weight, f2)
-            store(blurred, pad + j, f0)
-            store(blurred, stride + pad + j, f1)
-            store(blurred, 2 * stride + pad + j, f2)
+                at = (image * height + k) * size + j
+                sums = add_lines(made.factors, at, plane, window[k - row + _HALF], sums)
+            store_lines(blurred, pad + j, stride, sums)
         _clear_ends(blurred, pad, first, last)
         first, last = max(0, first - pad // 2), min(size, last + pad // 2)
         for place in range(first, last, LANES):
             j = min(place, last - LANES)
-            f0, f1, f2 = _fill(_ZERO), _fill(_ZERO), _fill(_ZERO)
+            sums = (_fill(_ZERO), _fill(_ZERO), _fill(_ZERO))
             for k in range(WINDOW):
-                i, weight = pad // 2 + j + k * channels, window[k]
-                f0 = fma(_load(blurred, i), weight, f0)
-                f1 = fma(_load(blurred, stride + i), weight, f1)
-                f2 = fma(_load(blurred, 2 * stride + i), weight, f2)
+                at = pad // 2 + j + k * channels
+                sums = add_lines(blurred, at, stride, window[k], sums)
+            f0, f1, f2 = sums
             at = job * size + j
             x, y = _load(images.x, at), _load(images.y, at)
             store(gradient, at, _load(made.direct, at) + f0 + x * f1 * _TWO + y * f2)

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from hwp_bench.base.kernels import helper
-from hwp_bench.hands import HandTemplate, TemplateTensors, pose_hand
+from hwp_bench.hands import HandTemplate, TemplateTensors, load_template, pose_hand
 from hwp_bench.hands.anchors import SurfaceAnchors, anchor_frames, anchor_positions, sample_surface
 from wildghand.gaussians.quaternions import matrix_to_quat
 from wildghand.splat.kernels.jit import jobs, kernel
@@ -378,25 +378,14 @@ class FollowCpu(torch.autograd.Function):
         for f, (turn, move, shape) in enumerate(zip(*given, shapes, strict=True)):
             frame = _pose_frame(turn, shape, tables, vertices)
             vertex_normals(vertices, tables.faces, normals)
-            run_pieces(
-                place_anchors,
-                count,
-                PIECE,
-                count,
-                vertices,
-                normals,
-                move,
-                tables.corners,
-                tables.first_edge,
-                tables.mix,
-                positions[f],
-                orientations[f],
-            )
+            surface = (vertices, normals, move, tables.corners, tables.first_edge, tables.mix)
+            made = (positions[f], orientations[f])
+            run_pieces(place_anchors, count, PIECE, count, *surface, *made)
             frames.append(frame)
-        made = torch.from_numpy(positions), torch.from_numpy(orientations)
+        posed = torch.from_numpy(positions), torch.from_numpy(orientations)
         ctx.tables, ctx.frames, ctx.shared = tables, frames, betas.dim() == 1
-        ctx.mark_non_differentiable(made[1])
-        return made
+        ctx.mark_non_differentiable(posed[1])
+        return posed
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -413,33 +402,8 @@ class FollowCpu(torch.autograd.Function):
                 + template.joint_basis.flatten(0, 1).mT @ of_joints
             )
         of_betas = torch.stack(betas)
-        return (
-            torch.stack(pose),
-            of_betas.sum(dim=0) if ctx.shared else of_betas,
-            gradients[0].sum(dim=1),
-            None,
-        )
-
-
-def warm_up_posing() -> None:
-    """Make the kernels ready, on a hand of one face: compiled once on a machine, loaded later."""
-    zeros = torch.zeros
-    template = TemplateTensors(
-        vertices=zeros(3, 3),
-        faces=torch.tensor([[0, 1, 2]]),
-        shape_basis=zeros(3, 3, 10),
-        pose_basis=None,
-        joints=zeros(16, 3),
-        joint_basis=zeros(16, 3, 10),
-        weights=torch.full((3, 16), 1 / 16),
-        mean_pose=zeros(15, 3),
-        fingertips=zeros(5, dtype=torch.int64),
-    )
-    anchors = SurfaceAnchors(zeros(1, dtype=torch.int64), torch.full((1, 3), 1 / 3))
-    pose = zeros(1, 16, 3, requires_grad=True)
-    tables = PosingTables.of(template, anchors)
-    with torch.enable_grad():
-        FollowCpu.apply(pose, zeros(10), zeros(1, 3), tables)[0].sum().backward()
+        of_betas = of_betas.sum(dim=0) if ctx.shared else of_betas
+        return torch.stack(pose), of_betas, gradients[0].sum(dim=1), None
 
 
 def _pose_frame(
@@ -468,35 +432,18 @@ def _frame_backward(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Gradients of pose (16, 3), rest vertices (V * 3,) and rest joints (48,)."""
     of_rest = np.empty_like(frame.rest)
+    joints = (tables.joint_of, tables.weight_of)
     of_turns, of_shifts = skin_backward(
-        of_points,
-        tables.corners,
-        tables.mix,
-        frame.rest,
-        tables.joint_of,
-        tables.weight_of,
-        frame.turns,
-        of_rest,
+        of_points, tables.corners, tables.mix, frame.rest, *joints, frame.turns, of_rest
     )
     rest = torch.from_numpy(of_rest).flatten()
     of_rotations = np.zeros((16, 3, 3))
     basis = tables.template.pose_basis
     if basis is not None:
         of_rotations[1:] = (basis.flatten(0, 1).mT @ rest).numpy().reshape(15, 3, 3)
-    of_pose, of_joints = chain_backward(
-        frame.pose,
-        frame.rest_joints,
-        frame.rotations,
-        frame.turns,
-        of_turns,
-        of_shifts,
-        of_rotations,
-    )
-    return (
-        torch.from_numpy(of_pose).float(),
-        rest,
-        torch.from_numpy(of_joints).float().flatten(),
-    )
+    forward = (frame.pose, frame.rest_joints, frame.rotations, frame.turns)
+    of_pose, of_joints = chain_backward(*forward, of_turns, of_shifts, of_rotations)
+    return torch.from_numpy(of_pose).float(), rest, torch.from_numpy(of_joints).float().flatten()
 
 
 #: Frames that are posed at a time, so that memory does not grow with the clip.
@@ -582,3 +529,11 @@ def rig_of(
     area = 0.5 * torch.linalg.cross(edges[:, 0], edges[:, 1]).norm(dim=-1).sum()
     spacing = float((area / len(anchors)).sqrt())
     return HandRig(tensors, anchors.to_torch(torch.float32, device), spacing)
+
+
+def warm_up_posing() -> None:
+    """Make the kernels ready: compiled once on a machine, loaded later."""
+    pose = torch.zeros(1, 16, 3, requires_grad=True)
+    with torch.enable_grad():
+        posed = make_rig(load_template(), 1).follow(pose, torch.zeros(10), torch.zeros(1, 3))
+        posed.positions.sum().backward()

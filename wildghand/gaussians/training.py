@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import torch
 
 from hwp_bench.base.arrays import evenly
 from hwp_bench.base.errors import BadInput
-from hwp_bench.capture import Cameras
-from hwp_bench.hands import HandParameters
+from hwp_bench.capture import Capture
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.gaussians.rig import AnchorPoses, HandRig
 
@@ -182,18 +180,6 @@ def _read_frames(training: TrainingCapture, numbers: np.ndarray) -> TrainingFram
     )
 
 
-class GivenFrames(Protocol):
-    """Frames whose hands and cameras are given: a training capture, or a whole capture."""
-
-    @property
-    def hands(self) -> Mapping[str, HandParameters]:
-        """Estimated hand parameters by side."""
-
-    @property
-    def cameras(self) -> Cameras:
-        """The camera of each frame."""
-
-
 class TrainingClip:
     """The given parameters of R frames; they are constant, so anchors are posed once.
 
@@ -212,7 +198,7 @@ class TrainingClip:
 
     def __init__(
         self,
-        training: GivenFrames,
+        training: TrainingCapture | Capture,
         indices: np.ndarray,
         rigs: Mapping[str, HandRig],
         device: torch.device,

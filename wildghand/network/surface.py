@@ -151,27 +151,12 @@ def bilinear_taps(uv: Tensor, resolution: int) -> tuple[Tensor, Tensor]:
     x = (uv[:, 0] * resolution - 0.5).clamp(0.0, resolution - 1.0)
     y = ((1.0 - uv[:, 1]) * resolution - 0.5).clamp(0.0, resolution - 1.0)
     left, top = x.floor().long(), y.floor().long()
-    right = (left + 1).clamp(max=resolution - 1)
-    bottom = (top + 1).clamp(max=resolution - 1)
-    across, down = x - left, y - top
-    index = torch.stack(
-        (
-            top * resolution + left,
-            top * resolution + right,
-            bottom * resolution + left,
-            bottom * resolution + right,
-        ),
-        dim=-1,
-    )
-    weight = torch.stack(
-        (
-            (1.0 - across) * (1.0 - down),
-            across * (1.0 - down),
-            (1.0 - across) * down,
-            across * down,
-        ),
-        dim=-1,
-    )
+    columns = torch.stack((left, (left + 1).clamp(max=resolution - 1)), dim=-1)
+    rows = torch.stack((top, (top + 1).clamp(max=resolution - 1)), dim=-1)
+    across = torch.stack((1.0 - (x - left), x - left), dim=-1)
+    down = torch.stack((1.0 - (y - top), y - top), dim=-1)
+    index = (rows[:, :, None] * resolution + columns[:, None]).flatten(1)
+    weight = (across[:, None] * down[:, :, None]).flatten(1)
     return index, weight
 
 

@@ -112,17 +112,7 @@ class PlainModel:
             (B, H, W, D), premultiplied, and (B, H, W, 1) coverage in [0, 1].
         """
         placed = self.gaussians.place(poses.positions, poses.orientations)
-        image, coverage, _ = rasterize(
-            placed.means,
-            placed.quats,
-            placed.scales,
-            placed.opacities,
-            channels,
-            viewmats,
-            Ks,
-            width,
-            height,
-        )
+        image, coverage, _ = rasterize(*placed, channels, viewmats, Ks, width, height)
         return image, coverage
 
 

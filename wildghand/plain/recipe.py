@@ -217,6 +217,8 @@ class Recipe(IterativeFit[Avatar], Generic[Settings]):
         optimizer.clear()
         loss.backward()
         optimizer.take_step(loss)
+        if optimizer.found_inf:  # a gradient is not finite: the fit has diverged
+            return math.nan
         self.move_back(drawn)
         self._steps += 1
         return value

@@ -19,12 +19,12 @@ import torch
 from hwp_bench.base.errors import MissingDependency
 from wildghand.splat import conventions as rules
 from wildghand.splat.reference import rasterize_reference
-from wildghand.splat.scene import FlatScene
+from wildghand.splat.scene import FlatScene, largest, usable
 
 #: Beyond this, squares of lengths leave float32 inside gsplat.
 _MAX_LENGTH = 1e15
 #: A quaternion's largest number; the gradient of one outside leaves float32.
-_LEAST_QUATERNION, _MAX_QUATERNION = 1e-36, 1e36
+_TURNS = (1e-36, 1e36)
 #: gsplat divides by the depth of all that is not nearer than the near plane.
 _LEAST_NEAR_PLANE = 1e-6
 #: gsplat takes leading batch dimensions from this version on.
@@ -99,7 +99,10 @@ def _harmless(scene: FlatScene) -> dict[str, torch.Tensor]:
     """The scene's tensors, with everything that gsplat cannot take made invisible."""
     names = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks")
     result = {name: getattr(scene, name) for name in names}
-    result["quats"], good = _usable(scene)
+    good, cameras = usable(scene, _MAX_LENGTH, _TURNS)
+    # The squares of a quaternion must stay in float32.
+    longest = torch.where(good["quats"], largest(scene.quats), 1.0)
+    result["quats"] = scene.quats / longest[..., None]
     neutral = _neutral(scene.means.device, scene.means.dtype)
     zero = neutral["zero"]
     for name, mask in good.items():
@@ -120,36 +123,9 @@ def _harmless(scene: FlatScene) -> dict[str, torch.Tensor]:
     if scene.backgrounds is not None:
         fine = scene.backgrounds.detach().abs() <= rules.MAX_COLOR
         result["backgrounds"] = torch.where(fine, scene.backgrounds, zero)
-    cameras = _camera_usable(result["viewmats"].detach(), result["Ks"].detach())
     for name in ("viewmats", "Ks"):
         result[name] = _replaced(result[name], cameras, neutral[name])
     return result
-
-
-def _usable(scene: FlatScene) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-    """Quaternions (S, N, 4) whose squares stay in float32, and masks (S, N) of what is usable."""
-    longest = _largest(scene.quats)
-    turns = (longest >= _LEAST_QUATERNION) & (longest <= _MAX_QUATERNION)
-    good = {
-        "means": _largest(scene.means) <= _MAX_LENGTH,
-        "scales": _largest(scene.scales) <= _MAX_LENGTH,
-        "quats": turns,
-        "colors": _largest(scene.colors) <= rules.MAX_COLOR,
-        "opacities": scene.opacities.detach().isfinite(),
-    }
-    return scene.quats / torch.where(turns, longest, 1.0)[..., None], good
-
-
-def _largest(tensor: torch.Tensor) -> torch.Tensor:
-    """The largest absolute number of each row; NaN where one is NaN."""
-    return torch.linalg.vector_norm(tensor.detach(), ord=torch.inf, dim=-1)
-
-
-def _camera_usable(viewmats: torch.Tensor, Ks: torch.Tensor) -> torch.Tensor:
-    """(I,) bool: cameras with finite numbers and focal lengths that float32 can square."""
-    focal = Ks.diagonal(dim1=-2, dim2=-1)[:, :2]
-    good = (focal > 0.0).all(1) & (_largest(Ks.flatten(1)) <= _MAX_LENGTH)
-    return good & viewmats.flatten(1).isfinite().all(1)
 
 
 def _replaced(tensor: torch.Tensor, good: torch.Tensor, value: torch.Tensor) -> torch.Tensor:

@@ -174,9 +174,14 @@ NO_CHANGE = 1e-6
 VICTIM = 7
 
 
-def _draw(scene: HardScene, context: Context, weights: torch.Tensor | None = None) -> DrawnScene:
-    dtype = torch.float64 if context.backend == "reference" else torch.float32
-    return draw(scene, context.backend, dtype, weights)
+def _draw(
+    scene: HardScene,
+    context: Context,
+    weights: torch.Tensor | None = None,
+    dtype: torch.dtype | None = None,
+) -> DrawnScene:
+    own = torch.float64 if context.backend == "reference" else torch.float32
+    return draw(scene, context.backend, dtype or own, weights)
 
 
 def _beside_float64(
@@ -185,10 +190,7 @@ def _beside_float64(
     """How far a drawing, and its gradients, are from the reference in the pixels that are clear."""
     clear = clear_pixels(scene)
     truth = draw(scene, "reference", torch.float64, clear)
-    if dtype is None:
-        drawing = _draw(scene, context, clear)
-    else:
-        drawing = draw(scene, context.backend, dtype, clear)
+    drawing = _draw(scene, context, clear, dtype)
     mask = clear.unsqueeze(-1)
     image = max(
         difference(drawing.image * mask, truth.image * mask),

@@ -18,6 +18,7 @@ from wildghand.splat.scene import (
     expected_depth,
     per_image,
     unflattened,
+    usable,
 )
 
 #: Elements of a (pixels, Gaussians) matrix that are worked on at a time.
@@ -34,23 +35,21 @@ def rasterize_reference(scene: FlatScene) -> tuple[torch.Tensor, torch.Tensor, d
     limits as in gsplat (see `conventions`).
     """
     options, images = scene.options, scene.images
-    means, quats, scales, opacities, colors = (
-        per_image(tensor, images)
-        for tensor in (scene.means, scene.quats, scene.scales, scene.opacities, scene.colors)
-    )
+    most = torch.finfo(scene.means.dtype).max
+    gaussians, cameras = usable(scene, most, (0.0, most))
+    masks = torch.stack([per_image(mask, images) for mask in gaussians.values()])
+    keep = masks.all(0) & cameras[:, None]
     whole: dict[str, list[torch.Tensor]] = {}
     indices = []
     for i in range(images):
-        keep = usable(means[i], quats[i], scales[i], opacities[i], colors[i])
-        keep &= camera_usable(scene.viewmats[i], scene.Ks[i])
-        index = keep.nonzero().squeeze(-1)
+        index = keep[i].nonzero().squeeze(-1)
         with torch.no_grad():
             seen = _project_some(scene, i, index)["seen"]
         # Once more without those that are not seen: zero times an infinite slope is NaN.
         index = index[seen]
         indices.append(index)
         for name, value in _project_some(scene, i, index).items():
-            empty = value.new_zeros(means.shape[1], *value.shape[1:])
+            empty = value.new_zeros(scene.gaussians, *value.shape[1:])
             whole.setdefault(name, []).append(empty.index_copy(0, index, value))
     flat = {name: torch.stack(values) for name, values in whole.items()}
     info: dict[str, Any] = {
@@ -91,24 +90,6 @@ def _project_some(scene: FlatScene, image: int, index: torch.Tensor) -> dict[str
     return project(
         means, quats, scales, opacities, scene.viewmats[image], scene.Ks[image], scene.options
     )
-
-
-def usable(
-    means: torch.Tensor,
-    quats: torch.Tensor,
-    scales: torch.Tensor,
-    opacities: torch.Tensor,
-    colors: torch.Tensor,
-) -> torch.Tensor:
-    """Which Gaussians have finite values, a rotation, and a colour within `MAX_COLOR`. (N,)."""
-    keep = means.isfinite().all(-1) & scales.isfinite().all(-1) & opacities.isfinite()
-    keep &= quats.isfinite().all(-1) & (quats != 0).any(-1)
-    return keep & (colors.abs() <= rules.MAX_COLOR).all(-1)
-
-
-def camera_usable(viewmat: torch.Tensor, K: torch.Tensor) -> torch.Tensor:
-    """Whether a camera can see: finite, with positive focal lengths. ()."""
-    return viewmat.isfinite().all() & K.isfinite().all() & (K[0, 0] > 0) & (K[1, 1] > 0)
 
 
 def rotation(quats: torch.Tensor) -> torch.Tensor:

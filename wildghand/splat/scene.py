@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from hwp_bench.base.errors import ShapeMismatch, UsageError
-from wildghand.splat.conventions import RASTERIZE_MODES, RENDER_MODES
+from wildghand.splat.conventions import MAX_COLOR, RASTERIZE_MODES, RENDER_MODES
 
 
 @dataclass(frozen=True)
@@ -77,6 +77,31 @@ def per_image(tensor: torch.Tensor, images: int) -> torch.Tensor:
         return tensor
     repeat = images // share if share else 0
     return tensor.unsqueeze(1).expand(share, repeat, *tensor.shape[1:]).flatten(0, 1)
+
+
+def largest(tensor: torch.Tensor) -> torch.Tensor:
+    """The largest absolute number of each row; NaN where one is NaN."""
+    return torch.linalg.vector_norm(tensor.detach(), ord=torch.inf, dim=-1)
+
+
+def usable(
+    scene: FlatScene, most: float, turns: tuple[float, float]
+) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
+    """What can be drawn: (S, N) masks of each argument's Gaussians, and (I,) of the cameras.
+
+    `most` is the largest length; the largest number of a quaternion lies between `turns`, the first
+    excluded. Colours stay within `MAX_COLOR`, focal lengths are positive, all is finite.
+    """
+    turn, focal = largest(scene.quats), scene.Ks.detach().diagonal(dim1=-2, dim2=-1)[:, :2]
+    gaussians = {
+        "means": largest(scene.means) <= most,
+        "scales": largest(scene.scales) <= most,
+        "quats": (turn > turns[0]) & (turn <= turns[1]),
+        "colors": largest(scene.colors) <= MAX_COLOR,
+        "opacities": scene.opacities.detach().isfinite(),
+    }
+    cameras = (focal > 0.0).all(1) & (largest(scene.Ks.flatten(1)) <= most)
+    return gaussians, cameras & scene.viewmats.detach().flatten(1).isfinite().all(1)
 
 
 def channel_count(scene: FlatScene) -> int:

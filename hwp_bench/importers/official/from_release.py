@@ -37,7 +37,7 @@ from hwp_bench.base.images import is_blank, read_gray, read_rgb
 from hwp_bench.capture import Cameras
 from hwp_bench.capture.schema import check_id
 from hwp_bench.hands import HandParameters, HandTemplate, load_template
-from hwp_bench.hands.fitting import FitTargets
+from hwp_bench.hands.fitting import FitTargets, FittedHand
 from hwp_bench.hands.poses import mirrored
 from hwp_bench.hands.skinning import pose_parameters
 from hwp_bench.hands.sources import FINGERTIPS
@@ -247,10 +247,12 @@ def import_official(
     if blank.any():
         numbers = records.numbers[blank].tolist()
         warnings.append(f"frames of one colour, as black ones, are not valid: {bounded(numbers)}")
-        hands = {side: made.without(blank) for side, made in hands.items()}
+        for side, hand in hands.items():
+            valid = hand.parameters.valid & ~blank
+            hands[side] = replace(hand, parameters=replace(hand.parameters, valid=valid))
     cameras = Cameras(np.stack([c.K for c in crops]), np.tile(np.eye(4), (len(crops), 1, 1)))
     clips = {
-        side: project_hand(load_template(options.model, side), made.hand, cameras)
+        side: project_hand(load_template(options.model, side), made.parameters, cameras)
         for side, made in hands.items()
     }
     # The tracker's joints in the crops: (F, 21 * sides, 2) px, NaN where not valid.
@@ -271,7 +273,7 @@ def import_official(
     entry = catalogue().get(folder.id)
     write_capture(
         out,
-        {side: made.hand for side, made in hands.items()},
+        {side: made.parameters for side, made in hands.items()},
         cameras,
         ((crop.image, crop.mask) for crop in crops),
         list(clips.values()),
@@ -303,7 +305,7 @@ def import_official(
 def _facts(
     folder: OfficialFolder,
     records: OfficialRecords,
-    hands: Mapping[str, ImportedHand],
+    hands: Mapping[str, FittedHand],
     clips: Mapping[str, ProjectedHand],
     tracked: np.ndarray,
     crops: list[CroppedFrame],
@@ -317,7 +319,7 @@ def _facts(
     """
     gaps, on_mask = {}, {}
     for index, (side, clip) in enumerate(clips.items()):
-        valid = hands[side].hand.valid
+        valid = hands[side].parameters.valid
         gap = np.linalg.norm(clip.landmarks - tracked[:, 21 * index : 21 * index + 21], axis=-1)
         gaps[side] = round(float(gap[valid].mean()), 3)
         on_mask[side] = round(_vertices_on_masks(clip, crops, valid), 4)
@@ -333,9 +335,9 @@ def _facts(
         "hands": list(hands),
         "hand_model": "anny" if options.mano is None else "mano",
         "official_compat": options.official_compat,
-        "frames_valid": {side: int(made.hand.valid.sum()) for side, made in hands.items()},
+        "frames_valid": {side: int(made.parameters.valid.sum()) for side, made in hands.items()},
         "vertex_error_mm": {
-            side: round(float(np.nanmean(made.error_mm)), 3) for side, made in hands.items()
+            side: round(float(np.nanmean(made.skin_mm)), 3) for side, made in hands.items()
         },
         "joint_error_px": gaps,
         "vertices_on_mask": on_mask,
@@ -430,27 +432,13 @@ def _share_on_mask(records: OfficialRecords, side: str) -> float:
 # --- Hands
 
 
-@dataclass(frozen=True, eq=False)
-class ImportedHand:
-    """One hand in the capture's convention."""
-
-    #: Its parameters.
-    hand: HandParameters
-    #: (F,) mean distance from the tracker's vertices, mm; NaN where not valid.
-    error_mm: np.ndarray
-
-    def without(self, frames: np.ndarray) -> ImportedHand:
-        """The same hand, not valid in some frames, (F,) bool."""
-        return replace(self, hand=replace(self.hand, valid=self.hand.valid & ~frames))
-
-
 def _import_hand(
     records: OfficialRecords,
     side: str,
     centres: np.ndarray,
     options: OfficialImport,
     folder: OfficialFolder,
-) -> ImportedHand:
+) -> FittedHand:
     """Take a hand over: MANO as it is, else the free hand fitted.
 
     `centres` are (F, 2) px, half the frames' sizes.
@@ -479,7 +467,7 @@ def _own_rotations(pose: np.ndarray, side: str) -> np.ndarray:
 
 def _mano_hand(
     records: SideRecords, template: HandTemplate, right_mean: np.ndarray, *, where: Path
-) -> ImportedHand:
+) -> FittedHand:
     """Take MANO's parameters over; one shape (the median) for the clip.
 
     `right_mean` is the (45,) mean pose of the right MANO hand, which the tracker poses.
@@ -503,7 +491,8 @@ def _mano_hand(
             remedy="Is --mano the MANO of mano_v1_2? Otherwise this file follows another "
             "convention than the release; import it without --mano.",
         )
-    return ImportedHand(replace(unplaced, transl=transl), np.where(valid, error, np.nan))
+    distance = np.where(valid, error, np.nan)
+    return FittedHand(replace(unplaced, transl=transl), np.full(len(pose), np.nan), distance)
 
 
 def _free_hand(
@@ -512,7 +501,7 @@ def _free_hand(
     focal: np.ndarray,
     centres: np.ndarray,
     knuckle: np.ndarray,
-) -> ImportedHand:
+) -> FittedHand:
     """Fit the free hand to the tracker's vertices and joints; MANO itself is not needed.
 
     `focal` (F,) and `centres` (F, 2) are px of the whole frame, `knuckle` (F, 3) m is the middle
@@ -527,5 +516,4 @@ def _free_hand(
     rays /= np.linalg.norm(rays, axis=2, keepdims=True)
     pose = _own_rotations(np.where(valid[:, None, None], records.pose, 0.0), template.side)
     targets = FitTargets(landmarks, rays, records.vertices[:, ::2])
-    fitted = fit_free_hand(template, pose, valid, knuckle, targets)
-    return ImportedHand(fitted.parameters, fitted.skin_mm)
+    return fit_free_hand(template, pose, valid, knuckle, targets)

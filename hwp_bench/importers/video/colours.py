@@ -317,19 +317,9 @@ def convert(
     codes: np.ndarray,
     out: np.ndarray,
 ) -> None:
-    """Convert the samples of a frame.
+    """Convert the samples of a frame, (H, W) uint16 Y', Cb and Cr, by what `_tables` returns.
 
-    Args:
-        luma, blue, red: (H, W) uint16, Y', Cb and Cr.
-        weights: (3,) of red, green and blue in Y'.
-        light: linear light for signals that are evenly spaced in [0, 1].
-        luminance: (3,) weights of linear light in luminance.
-        display: scales light, for square roots of luminance that are evenly spaced in [0, top];
-            one entry where nothing does.
-        factors: scales light, for largest components that are evenly spaced in [0, top].
-        matrix: (3, 3) to the primaries of sRGB.
-        codes: sRGB of 8 bits for square roots of light that are evenly spaced in [0, 1].
-        out: (H, W, 3) uint8, written.
+    `weights` (3,) are those of red, green and blue in Y'; `out` (H, W, 3) uint8 is written.
     """
     red_step = 2.0 * (1.0 - weights[0]) / chroma_span
     blue_step = 2.0 * (1.0 - weights[2]) / chroma_span

@@ -512,22 +512,14 @@ def cut_masks(
     def prompt(frame: int) -> Prompt:
         return projected.prompt(frame, edge, bool(detected[frame]))
 
-    def given(masks: np.ndarray) -> Iterator[tuple[Prompt, Segmentation]]:
-        for frame, mask in enumerate(masks):
-            small = resample(mask, edge)
-            yield prompt(frame), Segmentation(small, small)
-
-    found = (
-        given(own)
-        if own is not None
-        else segment_clip(
-            lambda frame: resample(working[frame], edge),
-            prompt,
-            len(working),
-            hand_size * edge / working.shape[1],
-            settings,
+    if own is None:
+        size_here = hand_size * edge / working.shape[1]
+        found = segment_clip(
+            lambda frame: resample(working[frame], edge), prompt, len(working), size_here, settings
         )
-    )
+    else:
+        given = (resample(mask, edge) for mask in own)
+        found = ((prompt(frame), Segmentation(one, one)) for frame, one in enumerate(given))
     coverage, fields, overlaps = [], [], []
     for drawn, masks in found:
         coverage.append(resample(masks.hand, size))

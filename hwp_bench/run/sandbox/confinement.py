@@ -19,7 +19,7 @@ from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import cache_root
 from hwp_bench.base.numerics import OPENCV_WAITING, OPENMP_WAITING, TORCH_COUNTS
 from hwp_bench.base.packages import PACKAGES
-from hwp_bench.methods.contents import is_foreign
+from hwp_bench.methods.contents import LEFT_OUT, unseen_folders
 from hwp_bench.methods.manifest import ships
 from hwp_bench.metrics.lpips import torch_home
 from hwp_bench.run.sandbox.launch import Place
@@ -33,8 +33,6 @@ VISIBLE_PACKAGES = frozenset(
     {"_data", "analysis", "base", "capture", "cli", "hands", "importers", "methods", "metrics"}
     | {"report", "results", "run", "tracking"}
 )
-#: Most folders of a method that are looked into.
-MAX_FOLDERS = 20_000
 #: `auto` takes namespaces where the system allows them and says so where it does not; `required`
 #: refuses to run without; `none` leaves the program its user's files and network.
 MODES = ("auto", "required", "none")
@@ -117,7 +115,7 @@ def sandbox_environment(
     It may write to its output folder, which holds a cache and a home that are empty when it begins
     and removed when it has ended: nothing that a method wrote reaches another run. It may read the
     machine code that the toolkit has compiled. It does not see the simulator, nor captures and
-    runs that lie below its own folder (`secluded`), unless `exposed` names them.
+    runs that lie below its own folder, unless `exposed` names them.
 
     Nothing that a method brings decides what is shown: not its command, nor links in its folder.
     """
@@ -135,13 +133,15 @@ def sandbox_environment(
     if weights.is_dir():
         environment["TORCH_HOME"] = str(weights)
     shown = {os.path.realpath(path) for path in confinement.exposed}
-    foreign = [path for path in foreign_folders(method.resolve()) if path not in shown]
+    unseen = unseen_folders(method.resolve(), ships=ships(method))
+    # A person may show a capture or a run, but not what is in no digest.
+    unseen = [path for path in unseen if path.name in LEFT_OUT or os.fspath(path) not in shown]
     kernels = _kernels()
     cache = [] if os.path.realpath(cache_root()) in shown else [cache_root().absolute()]
     places = visible_places(
         read=[method, request, weights, kernels, *_libraries(), *confinement.exposed],
         write=[output, kernels] if KEPT_KERNELS in environment else [output],
-        hidden=[*map(Path, foreign), *cache, *confinement.hidden],
+        hidden=[*unseen, *cache, *confinement.hidden],
         scratch=scratch_bytes(confinement.memory_bytes),
     )
     return environment, places
@@ -338,24 +338,3 @@ def _parts(package: str) -> list[str]:
             if entry.is_dir(follow_symlinks=False)
             and entry.name not in VISIBLE_PACKAGES | {"__pycache__"}
         ]
-
-
-def foreign_folders(method: Path) -> list[str]:
-    """Return the folders below a method's that do not belong to it: captures and outputs of runs.
-
-    They hold true frames. `is_foreign` knows them, as the digest of a method does. Links are not
-    followed; inside walls they lead nowhere.
-    """
-    found = []
-    for seen, (folder, folders, files) in enumerate(os.walk(method)):
-        if seen == MAX_FOLDERS:
-            raise UsageError(
-                f"holds more than {MAX_FOLDERS} folders, too many to tell what is the method's",
-                where=method,
-                remedy="Keep the method in a folder of its own.",
-            )
-        own = folder == os.fspath(method)
-        if not own and is_foreign(folder, files):
-            found.append(folder)
-            folders.clear()
-    return found

@@ -20,10 +20,7 @@ def generator(seed: int, *purpose: str | int) -> np.random.Generator:
 def fractal_noise(
     points: np.ndarray, scale: float, rng: np.random.Generator, octaves: int = 3
 ) -> np.ndarray:
-    """Value noise summed over octaves.
-
-    Takes `points` (N, 3) places. Returns (N,) with mean about 0 and standard deviation about 1.
-    """
+    """Value noise summed over octaves: (N,) with mean about 0 and standard deviation about 1."""
     from scipy.ndimage import map_coordinates
 
     lattice = rng.normal(size=(_LATTICE,) * 3)

@@ -1,26 +1,30 @@
-"""Surfaces that rays can hit: mesh arithmetic, materials, and building blocks of things."""
+"""Surfaces that rays can hit: mesh arithmetic, materials, building blocks of things, and rays."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+import time
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from msgspec import Meta
 
 from hwp_bench.base.colors import srgb_to_linear
+from hwp_bench.base.rays import ray_mesh
 from hwp_bench.hands.template import boundary_vertices
 
 if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
     from scipy.sparse import csr_matrix
 
 
 def subdivision(faces: np.ndarray, vertex_count: int) -> tuple[csr_matrix, np.ndarray]:
-    """One midpoint subdivision, written as a matrix.
+    """One midpoint subdivision: its (4 F, 3) faces, after the (V', V) matrix of per-vertex values.
 
-    Takes `faces` (F, 3). Returns (V', V) sparse matrix that turns per-vertex values into those of
-    the finer mesh, the first V rows unchanged, and its (4F, 3) faces.
+    The first V rows of the matrix leave the values as they are.
     """
     from scipy.sparse import csr_matrix
 
@@ -39,9 +43,7 @@ def subdivision(faces: np.ndarray, vertex_count: int) -> tuple[csr_matrix, np.nd
 
 
 def smoothing(faces: np.ndarray, vertex_count: int, rounds: int) -> csr_matrix:
-    """Taubin smoothing as one matrix: rounds facets off without shrinking.
-
-    The boundary stays where it is.
+    """Taubin smoothing as one matrix: rounds facets off without shrinking; the boundary stays.
 
     Source: Taubin, "A signal processing approach to fair surface design" (lambda 0.5, mu -0.53).
     """
@@ -82,10 +84,7 @@ def normal_operator(faces: np.ndarray, vertex_count: int) -> csr_matrix:
 
 
 def surface_normals(vertices: np.ndarray, faces: np.ndarray, operator: csr_matrix) -> np.ndarray:
-    """Unit normals at the vertices, weighted by area: (V, 3).
-
-    Takes `vertices` (V, 3), `faces` (F, 3).
-    """
+    """Unit normals at the vertices, weighted by area: (V, 3)."""
     a, b, c = (vertices[faces[:, corner]] for corner in range(3))
     return unit(operator @ np.cross(b - a, c - a))
 
@@ -100,6 +99,20 @@ def unit(vectors: np.ndarray) -> np.ndarray:
     """Vectors at length 1; zero stays zero."""
     length = np.sqrt(np.einsum("...i,...i->...", vectors, vectors))[..., None]
     return vectors / np.maximum(length, 1e-12)
+
+
+def perpendicular(vector: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """Unit vector of what of a vector is perpendicular to a unit axis, (3,) each."""
+    return unit(vector - (vector @ axis) * axis)
+
+
+def best_turn(places: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Rotation (3, 3) that brings centred places (N, 3) nearest to others (N, 3).
+
+    Source: the Kabsch algorithm.
+    """
+    u, _, vt = np.linalg.svd(target.T @ places)
+    return u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
 
 
 def _adjacency(faces: np.ndarray, vertex_count: int) -> csr_matrix:
@@ -183,6 +196,25 @@ def transformed(surface: Surface, transform: np.ndarray) -> Surface:
     )
 
 
+def rigid(turn: np.ndarray | None, place: np.ndarray | tuple[float, float, float]) -> np.ndarray:
+    """(4, 4) rigid motion of a rotation (3, 3), if any, and then a way (3,) m."""
+    move = np.eye(4)
+    if turn is not None:
+        move[:3, :3] = turn
+    move[:3, 3] = place
+    return move
+
+
+def reversed_faces(surface: Surface) -> Surface:
+    """A surface that looks to its other side."""
+    return replace(
+        surface,
+        faces=np.ascontiguousarray(surface.faces[:, ::-1]),
+        corner_uv=np.ascontiguousarray(surface.corner_uv[:, ::-1]),
+        normals=-surface.normals,
+    )
+
+
 def plain(color: tuple[float, float, float] | np.ndarray, **settings: float) -> Material:
     """A material of one linear colour."""
     albedo = np.asarray(color, dtype=np.float32).reshape(1, 1, 3)
@@ -201,9 +233,7 @@ def picture_material(image: np.ndarray, gloss: float) -> Material:
 
 def shift(surface: Surface, place: tuple[float, float, float] | np.ndarray) -> Surface:
     """A surface moved by (3,) m."""
-    move = np.eye(4)
-    move[:3, 3] = place
-    return transformed(surface, move)
+    return transformed(surface, rigid(None, place))
 
 
 _Channel = Annotated[float, Meta(ge=0.0, le=1.0)]
@@ -219,10 +249,7 @@ def shape(
     *,
     smooth: bool,
 ) -> Surface:
-    """Make a surface that is not a hand.
-
-    Takes `vertices` (V, 3) m, `faces` (F, 3), `corner_uv` (F, 3, 2).
-    """
+    """Make a surface that is not a hand."""
     if not smooth:
         vertices = vertices[faces].reshape(-1, 3)
         faces = np.arange(len(vertices)).reshape(-1, 3)
@@ -260,29 +287,28 @@ def box(size: tuple[float, float, float], material: Material) -> Surface:
     return shape(vertices, faces, uv, material, smooth=False)
 
 
-def turned(profile: np.ndarray, material: Material, around: int = 28) -> Surface:
-    """A solid of revolution about z.
+def turned(profile: ArrayLike, material: Material, around: int = 28) -> Surface:
+    """A solid of revolution about z, of rows of (radius, z) from one end to the other."""
+    profile = np.asarray(profile, dtype=np.float64)
+    radius, z = profile[:, :1], profile[:, 1:]
+    vertices = around_z(radius, z, np.linspace(0.0, 2.0 * np.pi, around + 1))
+    return grid(vertices, len(profile), around + 1, material, flip=profile[-1, 1] < profile[0, 1])
 
-    Takes `profile` (K, 2) rows of (radius, z) from one end to the other.
+
+def around_z(
+    radius: np.ndarray, z: np.ndarray, angles: np.ndarray, tall: np.ndarray | None = None
+) -> np.ndarray:
+    """Vertices of K rings about z at A angles: (K * A, 3).
+
+    `radius` and `z`, and `tall`, the half axis along y of rings that are ellipses, are (K, A) or
+    (K, 1).
     """
-    angles = np.linspace(0.0, 2.0 * np.pi, around + 1)
-    radius, z = profile[:, 0], profile[:, 1]
-    vertices = np.stack(
-        [
-            radius[:, None] * np.cos(angles),
-            radius[:, None] * np.sin(angles),
-            np.broadcast_to(z[:, None], (len(z), len(angles))),
-        ],
-        axis=-1,
-    ).reshape(-1, 3)
-    return grid(vertices, len(profile), around + 1, material, flip=z[-1] < z[0])
+    x, y = radius * np.cos(angles), (radius if tall is None else tall) * np.sin(angles)
+    return np.stack([x, y, np.broadcast_to(z, x.shape)], axis=-1).reshape(-1, 3)
 
 
 def tube(spine: np.ndarray, radius: np.ndarray, material: Material, *, around: int = 12) -> Surface:
-    """A tube with closed ends around a curve that runs along neither x nor y for long.
-
-    Takes `spine` (K, 3) m, `radius` (K,) m at each of its points.
-    """
+    """A tube with closed ends around a curve that runs along neither x nor y for long."""
     way = np.gradient(spine, axis=0)
     way /= np.linalg.norm(way, axis=1, keepdims=True)
     # The same axis everywhere, so that the tube does not twist.
@@ -314,6 +340,15 @@ def grid(
     return shape(vertices, faces, corner_uv, material, smooth=True)
 
 
+def sheet(
+    vertices: np.ndarray, rows: int, columns: int, material: Material, outward: np.ndarray
+) -> Surface:
+    """A `grid` that looks along the directions `outward`, (V, 3) or (3,), in the mean."""
+    made = grid(vertices, rows, columns, material)
+    looks_in = (made.normals * outward).sum() < 0
+    return grid(vertices, rows, columns, material, flip=True) if looks_in else made
+
+
 def canvas(height: int, width: int, color: Color) -> np.ndarray:
     """An image of one colour: (H, W, 3) uint8."""
     image = np.empty((height, width, 3), dtype=np.uint8)
@@ -330,3 +365,57 @@ def ink(color: Color) -> tuple[int, int, int]:
 def albedo(image: np.ndarray) -> np.ndarray:
     """Linear reflectance of a painted (H, W, 3) uint8 image: float32."""
     return srgb_to_linear(image / 255.0).astype(np.float32)
+
+
+#: Distance by which secondary rays leave their surface, m; below it a hand shades itself.
+LIFT = 4e-4
+
+
+@dataclass(frozen=True)
+class Hits:
+    """The points where rays meet a mesh."""
+
+    #: (H,) index of the ray.
+    ray: np.ndarray
+    #: (H,) face that was hit first.
+    face: np.ndarray
+    #: (H, 3) barycentric weights of the face's corners.
+    weights: np.ndarray
+    #: (H,) distance in lengths of the ray's direction.
+    distance: np.ndarray
+
+
+class Tracer:
+    """One mesh, ready to be asked what rays meet."""
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray, rays: Counter[str]) -> None:
+        self._mesh = ray_mesh(vertices, faces)
+        self._rays = rays
+
+    def first_hits(self, origins: np.ndarray, directions: np.ndarray, purpose: str) -> Hits:
+        """Find the first face on every ray."""
+        self._rays[purpose] += len(directions)
+        ray, face, u, v, distance = self._mesh.first_hits(origins, directions)
+        return Hits(ray, face, np.stack([1.0 - u - v, u, v], axis=1), distance)
+
+    def blocked(self, origins: np.ndarray, directions: np.ndarray, purpose: str) -> np.ndarray:
+        """Tell for every ray whether anything is in its way: (N,) bool."""
+        self._rays[purpose] += len(directions)
+        return self._mesh.blocked(origins, directions)
+
+
+@dataclass
+class RenderCost:
+    """Cost of rendering: seconds by pass, rays by purpose."""
+
+    #: Processor seconds by pass; other work on the machine does not count.
+    seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))
+    #: Rays by purpose.
+    rays: Counter[str] = field(default_factory=Counter)
+
+    @contextmanager
+    def time(self, name: str) -> Iterator[None]:
+        """Charge what happens inside to one pass."""
+        start = time.process_time()
+        yield
+        self.seconds[name] += time.process_time() - start

@@ -128,11 +128,12 @@ class AreaLight:
             self.distance
         )
 
-    def turned(self, rotation: np.ndarray, about: np.ndarray) -> AreaLight:
-        """The light turned by a (3, 3) rotation about a point (3,)."""
+    def turned(self, rotation: np.ndarray) -> AreaLight:
+        """The light turned by a (3, 3) rotation about the point looked at."""
+        focus = focus_point()
         return replace(
             self,
-            centre=about + rotation @ (self.centre - about),
+            centre=focus + rotation @ (self.centre - focus),
             across=rotation @ self.across,
             down=rotation @ self.down,
             facing=rotation @ self.facing,
@@ -148,8 +149,8 @@ class AreaLight:
         return np.asarray(share * self.irradiance)
 
 
-def area_light(lamp: Lamp, focus: np.ndarray) -> AreaLight:
-    """The light of a lamp, given the point looked at (3,) in the world."""
+def area_light(lamp: Lamp) -> AreaLight:
+    """The light of a lamp."""
     place = np.array(lamp.place)
     facing = -unit(place)
     # Upright as far as it can be; a lamp straight above has its width from left to right.
@@ -158,7 +159,7 @@ def area_light(lamp: Lamp, focus: np.ndarray) -> AreaLight:
     down = np.cross(facing, across)
     height = lamp.height or lamp.width
     return AreaLight(
-        centre=focus + place,
+        centre=focus_point() + place,
         across=0.5 * lamp.width * across,
         down=0.5 * height * down,
         facing=facing,
@@ -175,10 +176,7 @@ def wall_radiance(room: Room, sky: float) -> np.ndarray:
 
 
 def wall_irradiance(radiance: np.ndarray) -> np.ndarray:
-    """Irradiance over pi in the middle of a cube of walls, for normals along the axes: (6, 3).
-
-    Takes `radiance` (6, 3) as `wall_radiance` gives it.
-    """
+    """Irradiance over pi in the middle of a cube of walls, for normals along the axes: (6, 3)."""
     behind = radiance.reshape(3, 2, 3)[:, ::-1].reshape(6, 3)
     borders = radiance.sum(axis=0) - radiance - behind
     return np.asarray(FACING_SHARE * radiance + BORDER_SHARE * borders)
@@ -264,7 +262,7 @@ def steady_light(light: Light) -> Lights:
         key=light.key * lamp_color(light.kelvin),
         sky=sky * lamp_color(7000.0),
         ground=0.55 * sky * lamp_color(4800.0),
-        lamps=tuple(area_light(lamp, focus_point()) for lamp in light.lamps),
+        lamps=tuple(area_light(lamp) for lamp in light.lamps),
         room=None if light.room is None else wall_radiance(light.room, light.sky),
         backdrop=light.backdrop,
     )

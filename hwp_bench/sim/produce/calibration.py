@@ -21,15 +21,13 @@ from hwp_bench.base.colors import linear_to_srgb
 from hwp_bench.base.console import track
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.files import atomic_write
-from hwp_bench.sim.effects import hands_at, plan_frame, registered
+from hwp_bench.sim.effects import EFFECTS, hands_at, plan_frame
 from hwp_bench.sim.geometry.noise import generator
-from hwp_bench.sim.geometry.rays import RenderCost
+from hwp_bench.sim.geometry.surface import RenderCost
 from hwp_bench.sim.light.lights import steady_light
 from hwp_bench.sim.render.frame import carry_out
-from hwp_bench.sim.render.instant import Lens, render_instant
-from hwp_bench.sim.render.stage import Stage
-from hwp_bench.sim.scene.motion import intrinsics, viewmat
-from hwp_bench.sim.scene.scene import EffectCall, Scene, with_effects
+from hwp_bench.sim.render.stage import Lens, Stage, render_instant
+from hwp_bench.sim.scene.scene import EffectCall, Scene, intrinsics, viewmat, with_effects
 from hwp_bench.sim.scene_files import parse_scene
 from hwp_bench.sim.sensor import Sensor
 from hwp_bench.sim.subject.hand import MOVING
@@ -69,9 +67,10 @@ class Calibration:
 def calibrate(scene: Scene, call: EffectCall, size: int = SIZE) -> Calibration:
     """Solve an effect's strengths for the stated losses."""
     covering = call.kind == "hand_object_interaction"
-    top = registered(call.kind).max_strength
+    top = EFFECTS[call.kind].max_strength
     tried = top * (_TRIED_LINEAR if covering else _TRIED)
-    frames = _frames(scene, call)
+    # The middle of every episode.
+    frames = [round(0.5 * (part.start + part.end) * scene.frame_count) for part in call.episodes]
     measure = _measure(scene, call, frames, size)
     losses = [measure(float(strength)) for strength in track(tried, f"{scene.id} {call.kind}")]
     targets = TARGETS[call.kind]
@@ -112,11 +111,6 @@ def _with_strengths(text: str, item: Calibration, where: str) -> str:
     return changed
 
 
-def _frames(scene: Scene, call: EffectCall) -> list[int]:
-    """The middle of every episode."""
-    return [round(0.5 * (part.start + part.end) * scene.frame_count) for part in call.episodes]
-
-
 def _measure(
     scene: Scene, call: EffectCall, frames: list[int], size: int
 ) -> Callable[[float], float]:
@@ -147,7 +141,7 @@ def _pose_loss(scene: Scene, frame: int, size: int, strength: float) -> float:
     stage = Stage(scene, cost)
     seconds = plan_frame(scene, frame, scene.frame_count, size).seconds
     hands = hands_at(scene, seconds)
-    angle, length = registered("complex_poses").estimate_error(strength)
+    angle, length = EFFECTS["complex_poses"].estimate_error(strength)
     rng = generator(scene.seed, "calibration", frame)
     wrong = {}
     for side, (pose, transl) in stage.parameters(hands).items():
@@ -156,17 +150,10 @@ def _pose_loss(scene: Scene, frame: int, size: int, strength: float) -> float:
         wrong[side] = (pose + turn, transl + length * rng.normal(size=3) * [1.0, 1.0, 2.0])
     lens = Lens(intrinsics(scene, size), viewmat(scene, seconds), size, 1, seconds=seconds)
     lights = steady_light(scene.light)
-    images = [
-        render_instant(
-            scene,
-            lens,
-            stage.traced(stage.surface(hands, MOVING, parameters)),
-            None,
-            lights,
-            cost,
-        )
-        for parameters in (stage.parameters(hands), wrong)
-    ]
+    images = []
+    for parameters in (stage.parameters(hands), wrong):
+        body = stage.traced(stage.surface(hands, MOVING, parameters))
+        images.append(render_instant(scene, lens, body, None, lights, cost))
     hand = images[0].coverage > 0.999
     true, believed = (linear_to_srgb(image.color[hand]) for image in images)
     return _psnr(believed, true)

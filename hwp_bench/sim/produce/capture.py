@@ -1,7 +1,7 @@
-"""From a scene to a capture folder: frames in parallel, resumable, the same on any machine.
+"""From a scene to a capture folder, and from a suite to captures in the cache.
 
-Frames wait in one file each until their capture is whole; a render that was interrupted goes on
-where it stopped.
+Frames are rendered in parallel, the same on any machine. They wait in one file each until their
+capture is whole; a render that was interrupted goes on where it stopped.
 """
 
 from __future__ import annotations
@@ -13,17 +13,18 @@ import os
 import shutil
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
 from hwp_bench.base.arrays import read_npz
 from hwp_bench.base.console import progress
 from hwp_bench.base.errors import BadInput, HwpError, UsageError, place, reason_of, whole_number
-from hwp_bench.base.files import atomic_write, canonical_json, sha256_json
+from hwp_bench.base.files import atomic_write, cache_root, canonical_json, sha256_json
 from hwp_bench.base.folders import exclusive
 from hwp_bench.capture import (
     Cameras,
@@ -35,21 +36,19 @@ from hwp_bench.capture import (
 )
 from hwp_bench.capture.schema import FREE_VIEW, SIMULATED
 from hwp_bench.hands.skeleton import HandParameters
-from hwp_bench.run.engine import Job, Needs
-from hwp_bench.run.engine.job import OnProgress
+from hwp_bench.run.engine import Engine, Job, LocalEngine, Needs
+from hwp_bench.run.engine.job import OnProgress, ignore_progress
 from hwp_bench.run.engine.processes import THREADS, LocalJob, Stopped, WorkerLost, run_in_process
 from hwp_bench.sim.effects import FramePlan, hands_at, plan_frame
 from hwp_bench.sim.hand.rigs import rig_path
 from hwp_bench.sim.produce.estimates import confused_mask, estimate_hands, estimate_mask
-from hwp_bench.sim.produce.free_view import add_free_view, has_free_view, write_free_view
+from hwp_bench.sim.produce.free_view import has_free_view, write_free_view
 from hwp_bench.sim.produce.truth import distances, write_truth
 from hwp_bench.sim.render.frame import eight_bit_coverage, render_frame, write_layers
-from hwp_bench.sim.scene.motion import intrinsics, parameters_of, scene_hands, viewmat
-from hwp_bench.sim.scene.scene import Scene
-from hwp_bench.sim.scene_files import load_scene
+from hwp_bench.sim.scene.scene import Scene, intrinsics, parameters_of, scene_hands, viewmat
+from hwp_bench.sim.scene_files import load_scene, scene_groups, scene_names
 from hwp_bench.sim.sensor import check_encoder, through_h264
-from hwp_bench.sim.subject.atlas import skin_atlas
-from hwp_bench.sim.subject.skin import of_side
+from hwp_bench.sim.subject.hand import of_side, skin_atlas
 
 #: Version of the pixels that the renderer makes; part of every render key.
 RENDERER = 10
@@ -61,8 +60,6 @@ LICENCE = "CC0-1.0"
 FRAMES, SIZES, MAX_WORKERS = (10, 100_000), (32, 1024), 1024
 # Frames below which a second process costs more than it saves.
 _FRAMES_PER_WORKER = 10
-# Seconds between two counts of the frames that wait.
-_COUNT_SECONDS = 1.0
 _REMEDY = "Finished frames are kept; the same command continues from there."
 
 
@@ -142,38 +139,27 @@ class RenderRequest:
 
     def __call__(self, inputs: Mapping[str, Path], output: Path, on_progress: OnProgress) -> None:
         """Render; see `hwp_bench.run.engine.job.Work`."""
-        ended = threading.Event()
-        watch = threading.Thread(target=self._count, args=(output, on_progress, ended), daemon=True)
-        watch.start()
-        try:
-            self.render(output)
-        finally:
-            ended.set()
-            watch.join()
+        self.render(output, on_progress)
 
-    def render(self, output: Path) -> None:
+    def render(self, output: Path, on_progress: OnProgress = ignore_progress) -> None:
         """Render into a folder, or use the capture that exists there if `keep` says so.
 
         The free-view clip of a capture that exists is rendered where it is missing.
         """
         if not self.keep:
-            _render(self.checked(), output)
+            _render(self.checked(), output, on_progress)
             return
         with exclusive(output, wait=True):
             if not _is_capture(output):
-                _render(replace(self.checked(), overwrite=True), output)
+                _render(replace(self.checked(), overwrite=True), output, on_progress)
             elif not self.is_whole(output):
-                add_free_view(self.checked().scene, open_capture(output))
+                capture = open_capture(output)
+                clip = output / FREE_VIEW
+                write_free_view(self.checked().scene, clip, capture.info, capture.hands)
 
     def is_whole(self, output: Path) -> bool:
         """Whether a folder holds a capture with all that is asked for."""
         return _is_capture(output) and (not self.free_view or has_free_view(output))
-
-    def _count(self, output: Path, on_progress: OnProgress, ended: threading.Event) -> None:
-        """Report how many frames of the unfinished capture exist."""
-        while not ended.wait(_COUNT_SECONDS):
-            waiting = sum(1 for _ in output.parent.glob(f".{output.name}.*/*.npz"))
-            on_progress(waiting, self.frames)
 
 
 def _is_capture(folder: Path) -> bool:
@@ -230,13 +216,12 @@ def render_capture(
         exr=exr,
         overwrite=overwrite,
         free_view=free_view,
-    ).checked()
-    out = place(out, "out")
-    _render(request, out)
-    return open_capture(out)
+    )
+    request.render(place(out, "out"))
+    return open_capture(place(out, "out"))
 
 
-def _render(request: RenderRequest, out: Path) -> None:
+def _render(request: RenderRequest, out: Path, on_progress: OnProgress) -> None:
     """Render a request that was checked."""
     if out.exists() and not request.overwrite and (out.is_file() or any(out.iterdir())):
         raise UsageError(
@@ -251,7 +236,7 @@ def _render(request: RenderRequest, out: Path) -> None:
             raise HwpError(f"cannot be made ({reason_of(error)})", where=waiting) from error
         try:
             start = time.perf_counter()
-            _render_missing(request, waiting)
+            _render_missing(request, waiting, on_progress)
             _assemble(request, waiting, out, time.perf_counter() - start)
             shutil.rmtree(waiting, ignore_errors=True)
         finally:
@@ -262,7 +247,7 @@ def _render(request: RenderRequest, out: Path) -> None:
                 waiting.with_name(f"{waiting.name}.lock").unlink()
 
 
-def _render_missing(request: RenderRequest, waiting: Path) -> None:
+def _render_missing(request: RenderRequest, waiting: Path, on_progress: OnProgress) -> None:
     scene = request.scene
     missing = [frame for frame in range(request.frames) if _read_frame(waiting, frame) is None]
     if not missing:
@@ -274,13 +259,17 @@ def _render_missing(request: RenderRequest, waiting: Path) -> None:
     workers = request.workers
     if workers is None:
         workers = max(1, min(os.cpu_count() or 1, len(missing) // _FRAMES_PER_WORKER))
+    works = [RenderFrames(request, missing[first::workers]) for first in range(workers)]
     with progress(f"Rendering {scene.id}", len(missing)) as update:
+
+        def count(done: int, total: int) -> None:
+            update(done)
+            on_progress(request.frames - len(missing) + done, request.frames)
+
         if workers == 1:
-            RenderFrames(request, missing)({}, waiting, lambda done, total: update(done))
-            return
-        works = [RenderFrames(request, missing[first::workers]) for first in range(workers)]
-        _render_in_processes(works, waiting, update)
-        update(len(missing))
+            works[0]({}, waiting, count)
+        else:
+            _render_in_processes(works, waiting, count)
 
 
 @dataclass(frozen=True)
@@ -338,7 +327,7 @@ def _read_frame(folder: Path, frame: int) -> dict[str, np.ndarray] | None:
 
 
 def _render_in_processes(
-    works: Sequence[RenderFrames], folder: Path, on_progress: Callable[[int], None]
+    works: Sequence[RenderFrames], folder: Path, on_progress: OnProgress
 ) -> None:
     """Render frames in as many processes as there are works; if one fails, all are ended."""
     stop = threading.Event()
@@ -347,12 +336,13 @@ def _render_in_processes(
     def run(index: int) -> None:
         def count(steps: int, total: int) -> None:
             done[index] = steps
-            on_progress(sum(done))
+            on_progress(sum(done), sum(len(work.frames) for work in works))
 
         # One thread each: the processes share the processors.
         job = LocalJob(works[index], {}, folder.absolute(), dict.fromkeys(THREADS, "1"))
         try:
             run_in_process(job, count, stop.is_set)
+            count(len(works[index].frames), 0)
         except BaseException:
             stop.set()
             raise
@@ -369,12 +359,9 @@ def _render_in_processes(
             problem = f"a rendering process was killed ({error})"
             raise HwpError(problem, where=works[0].request.scene.id, remedy=_REMEDY) from error
         if isinstance(error, HwpError):
-            raise type(error)(
-                error.problem,
-                where=error.where,
-                field=error.field,
-                remedy=error.remedy or _REMEDY,
-            ) from error
+            remedy = error.remedy or _REMEDY
+            again = type(error)(error.problem, where=error.where, field=error.field, remedy=remedy)
+            raise again from error
         if error is not None and not isinstance(error, Stopped):
             raise error
 
@@ -475,3 +462,139 @@ def _info(scene: Scene, plans: list[FramePlan], size: int) -> CaptureInfo:
         },
         licence=LICENCE,
     )
+
+
+@dataclass(frozen=True)
+class SuiteItem:
+    """One capture of a suite."""
+
+    #: The scene.
+    scene: Scene
+    #: Frames over which it is spread.
+    frame_count: int
+    #: Edge of the image in pixels.
+    size: int
+
+
+# One single-hand and one interacting capture for each perturbation: interaction 0 and 5,
+# complex poses 1 and 6, illumination 2 and 7, motion blur 3 and 4.
+_MINI = tuple(f"capture{number}" for number in range(8))
+
+
+@dataclass(frozen=True)
+class _Rule:
+    """How a suite is made of scenes."""
+
+    #: Edge of the image, px.
+    size: int
+    #: Frames of each capture, over the same motions; None: by the paper's number and `every`.
+    frames: int | None = None
+    #: The captures; None: all of the group of scenes with the suite's name, or the eleven.
+    captures: tuple[str, ...] | None = None
+    #: Without `frames`: how many of the paper's frames stand for one of the suite's.
+    every: int = 1
+
+
+_SUITES: Mapping[str, _Rule] = MappingProxyType(
+    {
+        "smoke": _Rule(112, 30, ("capture0", "capture4")),
+        "mini": _Rule(176, 60, _MINI),
+        "full-lite": _Rule(256, every=12),
+        "full": _Rule(256),
+        "wild-dev": _Rule(176, 60),
+        "wild-test": _Rule(176, 60),
+    }
+)
+
+
+def suite_names() -> tuple[str, ...]:
+    """Names of the suites: those of the paper's captures, smallest first, then the wild ones."""
+    return tuple(_SUITES)
+
+
+def suite(name: str) -> tuple[SuiteItem, ...]:
+    """Return the captures of a suite.
+
+    Args:
+        name: `smoke` (seconds), `mini` (minutes), `full` (hours), `full-lite` (a twelfth
+            of its frames), or of scenes that are as wide as the world: `wild-dev` (for tuning)
+            or `wild-test` (for reports only).
+
+    Raises:
+        UsageError: there is no such suite.
+    """
+    if name not in _SUITES:
+        raise UsageError(f"there is no suite {name!r}", remedy=f"Known: {', '.join(_SUITES)}.")
+    rule = _SUITES[name]
+    group = name if name in scene_groups() else ""
+    scenes = [load_scene(capture) for capture in rule.captures or scene_names(group)]
+    return tuple(
+        SuiteItem(scene, rule.frames or -(-scene.frame_count // rule.every), rule.size)
+        for scene in scenes
+    )
+
+
+def ensure_suite(
+    name: str | Sequence[SuiteItem],
+    cache: str | os.PathLike[str] | None = None,
+    workers: int | None = None,
+    *,
+    engine: Engine | None = None,
+    needs: Needs | None = None,
+    free_view: bool = True,
+) -> list[Path]:
+    """Render the captures of a suite that are not in the cache yet.
+
+    Args:
+        name: a suite, or captures such as some of one.
+        cache: folder of captures; the toolkit's cache if None.
+        workers: processes for each render.
+        engine: where captures are rendered; one after another in this process if None.
+        needs: what one render takes of a machine.
+        free_view: also render free-view clips, which captures in the cache may lack.
+
+    Returns:
+        The capture folders, in the suite's order.
+
+    Raises:
+        UsageError: there is no such suite.
+        HwpError: a render failed; captures that were finished stay.
+    """
+    engine, needs = engine or LocalEngine(), needs or Needs()
+    items = suite(name) if isinstance(name, str) else name
+    each = workers_each(workers, engine, needs)
+    jobs = [
+        RenderRequest(
+            item.scene, item.frame_count, item.size, workers=each, keep=True, free_view=free_view
+        ).job(_folder(item, cache), needs)
+        for item in items
+    ]
+    if not all(job.finished() for job in jobs):
+        engine.run(jobs, lambda index: None)
+    return [job.output for job in jobs]
+
+
+def is_rendered(name: str, cache: str | os.PathLike[str] | None = None) -> bool:
+    """Whether every capture of a suite is in the cache, with its free-view clip."""
+    return all(
+        RenderRequest(item.scene, item.frame_count, item.size, keep=True).is_whole(
+            _folder(item, cache)
+        )
+        for item in suite(name)
+    )
+
+
+def _folder(item: SuiteItem, cache: str | os.PathLike[str] | None) -> Path:
+    """Where a capture lies in the cache."""
+    root = Path(cache) if cache is not None else cache_root() / "sim" / "captures"
+    key = render_key(item.scene, item.frame_count, item.size)
+    return root / f"{item.scene.id}-{item.frame_count}x{item.size}-{key[:12]}"
+
+
+def workers_each(workers: int | None, engine: Engine, needs: Needs) -> int | None:
+    """The processes of one render: as asked for, else as many as the engine allows.
+
+    In turn each render takes as many as are worth it; where several run at once, the processors
+    of a job.
+    """
+    return workers if workers is not None or engine.in_turn else max(1, int(needs.cpus))

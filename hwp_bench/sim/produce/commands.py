@@ -14,15 +14,15 @@ from hwp_bench.sim.scene.scene import Scene
 from hwp_bench.sim.scene_files import known_scenes, load_scene, meant_scenes, scene_path
 
 if TYPE_CHECKING:
-    from hwp_bench.run.engine import Engine
+    pass
 
 
 def list_scenes(args: argparse.Namespace) -> int:
     """Print the scenes, and what scenes can be made of."""
     from hwp_bench.hands.poses import gestures
     from hwp_bench.sim.effects import ORDER
-    from hwp_bench.sim.produce.suites import suite, suite_names
-    from hwp_bench.sim.props.backdrops import backdrop_names
+    from hwp_bench.sim.produce.capture import suite, suite_names
+    from hwp_bench.sim.props.behind import backdrop_names
     from hwp_bench.sim.props.objects import object_names
 
     scenes = [load_scene(name) for name in known_scenes()]
@@ -86,7 +86,7 @@ def print_plan(args: argparse.Namespace) -> int:
 def render(args: argparse.Namespace) -> int:
     """Render captures and print their folders."""
     from hwp_bench.run.engine.options import engine_for, needs_of
-    from hwp_bench.sim.produce.suites import ensure_suite
+    from hwp_bench.sim.produce.capture import RenderRequest, ensure_suite, workers_each
 
     if (args.suite is None) == (args.scene is None):
         raise UsageError("give a scene, all, or a suite with --suite")
@@ -112,45 +112,35 @@ def render(args: argparse.Namespace) -> int:
     if args.seed is not None and args.seed < 0:
         raise UsageError(f"is {args.seed}", field="--seed", remedy="Use 0 or more.")
     scenes = [_changed(scene, args.severity, args.subject) for scene in _scenes([args.scene])]
+    named = Path(args.scene)
     check_places(
         {"--out": args.out},
-        {"SCENE": _scene_file(args.scene)},
+        {"SCENE": named if named.is_file() else None},
         replaces=args.overwrite,
         makes_captures=len(scenes) == 1,
     )
+    jobs, needs = [], needs_of(args)
     with engine_for(args) as engine:
-        folders = _render_scenes(args, scenes, engine)
-    for folder in folders:
-        print(folder)
-    return 0
-
-
-def _render_scenes(args: argparse.Namespace, scenes: list[Scene], engine: Engine) -> list[Path]:
-    from hwp_bench.run.engine.options import needs_of
-    from hwp_bench.sim.produce.capture import RenderRequest
-    from hwp_bench.sim.produce.suites import workers_each
-
-    needs = needs_of(args)
-    jobs = []
-    for scene in scenes:
-        out = Path(args.out) / scene.id if len(scenes) > 1 else Path(args.out)
-        if not args.overwrite and (out.is_file() or (out.is_dir() and any(out.iterdir()))):
-            raise UsageError(
-                "exists already", where=out, remedy="Choose another place or --overwrite."
+        for scene in scenes:
+            out = Path(args.out) / scene.id if len(scenes) > 1 else Path(args.out)
+            if not args.overwrite and (out.is_file() or (out.is_dir() and any(out.iterdir()))):
+                remedy = "Choose another place or --overwrite."
+                raise UsageError("exists already", where=out, remedy=remedy)
+            request = RenderRequest(
+                scene,
+                args.frames,
+                args.size,
+                args.seed,
+                workers=workers_each(args.workers, engine, needs),
+                exr=args.exr,
+                overwrite=args.overwrite,
+                free_view=args.free_view,
             )
-        request = RenderRequest(
-            scene,
-            args.frames,
-            args.size,
-            args.seed,
-            workers=workers_each(args.workers, engine, needs),
-            exr=args.exr,
-            overwrite=args.overwrite,
-            free_view=args.free_view,
-        )
-        jobs.append(request.job(out, needs))
-    engine.run(jobs, lambda index: None)
-    return [job.output for job in jobs]
+            jobs.append(request.job(out, needs))
+        engine.run(jobs, lambda index: None)
+    for job in jobs:
+        print(job.output)
+    return 0
 
 
 def preview(args: argparse.Namespace) -> int:
@@ -180,18 +170,10 @@ def calibrate_scenes(args: argparse.Namespace) -> int:
         results = [calibrate(scene, call) for call in calls]
         if args.write:
             write_strengths(scene_path(name) if name in known_scenes() else Path(name), results)
+        digest = load_scene(name).digest if args.write else scene.digest
         for item in results:
-            rows.append(
-                {
-                    "scene": scene.id,
-                    "digest": load_scene(name).digest if args.write else scene.digest,
-                    "effect": item.kind,
-                    "measure": item.measure,
-                    "strengths": item.strengths,
-                    "measured": item.measured,
-                    "targets": item.targets,
-                }
-            )
+            row = asdict(item)
+            rows.append({"scene": scene.id, "digest": digest, "effect": row.pop("kind"), **row})
             if not args.json:
                 measured = " ".join(f"{value:7.3f}" for value in item.measured)
                 target = " ".join(f"{value:7.3f}" for value in item.targets)
@@ -199,11 +181,6 @@ def calibrate_scenes(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps(rows, indent=1))
     return 0
-
-
-def _scene_file(name: str) -> Path | None:
-    """The file that a scene was named by, if any."""
-    return Path(name) if Path(name).is_file() else None
 
 
 def _scenes(names: list[str]) -> list[Scene]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from hwp_bench.base.tables import Cell, Column, Table
 from hwp_bench.sim.effects import ORDER, FramePlan, plan_frame
-from hwp_bench.sim.geometry.rays import RenderCost
+from hwp_bench.sim.geometry.surface import RenderCost
 from hwp_bench.sim.produce.capture import check_extent
 from hwp_bench.sim.produce.free_view import FRAMES, free_views, render_free
 from hwp_bench.sim.render.frame import carry_out, steady_gain

@@ -18,17 +18,17 @@ import numpy as np
 from hwp_bench.base.console import progress
 from hwp_bench.base.errors import HwpError
 from hwp_bench.base.numerics import kd_tree
-from hwp_bench.capture import Cameras, Capture, CaptureInfo, CaptureWriter, open_capture
+from hwp_bench.capture import Cameras, CaptureInfo, CaptureWriter, open_capture
 from hwp_bench.capture.schema import FREE_VIEW, MAX_ID
 from hwp_bench.hands.poses import gestures, within_limits
 from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.sim.geometry.noise import generator
-from hwp_bench.sim.geometry.rays import RenderCost
-from hwp_bench.sim.geometry.surface import unit
-from hwp_bench.sim.light.lights import FOCUS_DISTANCE, focus_point
+from hwp_bench.sim.geometry.surface import RenderCost, unit
+from hwp_bench.sim.light.lights import FOCUS_DISTANCE
 from hwp_bench.sim.render.frame import eight_bit_coverage, render_view, steady_gain
-from hwp_bench.sim.scene.motion import (
+from hwp_bench.sim.scene.scene import (
     HandMoment,
+    Scene,
     hand_parameters,
     heading_matrix,
     intrinsics,
@@ -36,7 +36,6 @@ from hwp_bench.sim.scene.motion import (
     scene_hands,
     track_moment,
 )
-from hwp_bench.sim.scene.scene import Scene
 from hwp_bench.sim.subject.hand import template_vertices
 
 #: Frames of a clip.
@@ -109,11 +108,9 @@ def free_moments(scene: Scene, count: int = FRAMES) -> list[dict[str, HandMoment
             rng = generator(scene.seed, "free pose", side, frame)
             shape = gestures()[names[order[frame % len(names)]]]
             moment = track_moment(scene, side, seconds)
-            hands[side] = replace(
-                moment,
-                angles=within_limits(shape + rng.normal(0.0, _ANGLES, shape.shape)),
-                heading=moment.heading + rng.normal(0.0, _TURN, 3),
-            )
+            angles = within_limits(shape + rng.normal(0.0, _ANGLES, shape.shape))
+            heading = moment.heading + rng.normal(0.0, _TURN, 3)
+            hands[side] = HandMoment(angles, moment.place, heading)
         frames.append(hands)
     return frames
 
@@ -214,7 +211,7 @@ def _surfaces(scene: Scene, hands: Mapping[str, HandMoment]) -> dict[str, np.nda
     """Vertices of the posed hands before they are refined, by side: (T, 3) m each."""
     found = {}
     for side, subject in scene_hands(scene).items():
-        pose, transl = hand_parameters(hands[side], side, subject.joints, focus_point())
+        pose, transl = hand_parameters(hands[side], side, subject.joints)
         found[side] = template_vertices(subject.tensors, pose, subject.betas, transl)
     return found
 
@@ -232,10 +229,8 @@ def _apart(scene: Scene, hands: dict[str, HandMoment]) -> dict[str, HandMoment]:
     while tree.query(surfaces[first] + push * line)[0].min() < GAP:
         push += GAP / 2.0
     half = push / 2.0 * line
-    return {
-        first: replace(one, place=one.place + half),
-        second: replace(other, place=other.place - half),
-    }
+    moved = (replace(one, place=one.place + half), replace(other, place=other.place - half))
+    return dict(zip((first, second), moved, strict=True))
 
 
 def has_free_view(capture: Path) -> bool:
@@ -245,11 +240,6 @@ def has_free_view(capture: Path) -> bool:
     except HwpError:
         return False
     return clip.info.source.get("version") == VERSION
-
-
-def add_free_view(scene: Scene, capture: Capture) -> None:
-    """Render the clip into a capture of this scene that has none."""
-    write_free_view(scene, capture.root / FREE_VIEW, capture.info, capture.hands)
 
 
 def write_free_view(
@@ -290,12 +280,10 @@ def write_free_view(
 def render_free(
     scene: Scene, item: FreeView, size: int, gain: np.ndarray, cost: RenderCost
 ) -> tuple[FreeView, np.ndarray, np.ndarray]:
-    """Render one frame of the clip.
+    """Render one frame of the clip: the frame with the camera that was taken, image, and coverage.
 
     Where the hand is hidden, by the sleeve or by what is worn, the camera moves towards the
     fingers until some of it is seen.
-
-    Returns the frame with the camera that was taken, (S, S, 3) uint8 sRGB, (S, S) coverage 0-1.
     """
     for _ in range(_MOVES):
         rgb, coverage = render_view(scene, item.hands, item.view, size, gain, cost)

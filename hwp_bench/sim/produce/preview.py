@@ -13,13 +13,11 @@ from hwp_bench.base.errors import MissingDependency, UsageError
 from hwp_bench.base.files import atomic_write
 from hwp_bench.base.images import write_image
 from hwp_bench.sim.effects import hands_at, lights_at, objects_at, plan_frame
-from hwp_bench.sim.geometry.rays import RenderCost
-from hwp_bench.sim.geometry.surface import Surface
+from hwp_bench.sim.geometry.surface import RenderCost, Surface
 from hwp_bench.sim.light.lights import focus_point
 from hwp_bench.sim.render.frame import SimulatedFrame, render_frame
 from hwp_bench.sim.render.stage import Stage
-from hwp_bench.sim.scene.motion import viewmat
-from hwp_bench.sim.scene.scene import Scene
+from hwp_bench.sim.scene.scene import Scene, viewmat
 from hwp_bench.sim.subject.hand import MOVING
 from hwp_bench.taxonomy import perturbation
 
@@ -71,21 +69,16 @@ def strip(results: list[SimulatedFrame], columns: int) -> np.ndarray:
 
 
 def _captioned(result: SimulatedFrame) -> np.ndarray:
-    severity = [
-        f"{perturbation(name).short}{value}"
-        for name, value in result.plan.severity.items()
-        if value
-    ]
-    return captioned(result.rgb, " ".join([str(result.plan.frame), *severity]))
+    acting = ((name, value) for name, value in result.plan.severity.items() if value)
+    words = [f"{perturbation(name).short}{value}" for name, value in acting]
+    return captioned(result.rgb, " ".join([str(result.plan.frame), *words]))
 
 
 def _animation(results: list[SimulatedFrame]) -> bytes:
     from PIL import Image
 
-    frames = [
-        Image.fromarray(np.concatenate([result.rgb, result.clean], axis=1)).quantize(128)
-        for result in results
-    ]
+    pairs = [np.concatenate([result.rgb, result.clean], axis=1) for result in results]
+    frames = [Image.fromarray(pair).quantize(128) for pair in pairs]
     buffer = io.BytesIO()
     frames[0].save(
         buffer, format="GIF", save_all=True, append_images=frames[1:], duration=FRAME_MS, loop=0

@@ -16,8 +16,7 @@ from hwp_bench.base.tables import Cell, Column, Table
 from hwp_bench.capture import Capture
 from hwp_bench.capture.schema import EXTRA, SIMULATED, TRUE_TEMPLATE, write_subject_mesh
 from hwp_bench.hands.template import HandTemplate, rebuilt
-from hwp_bench.sim.scene.motion import palm_of, scene_hands
-from hwp_bench.sim.scene.scene import Scene
+from hwp_bench.sim.scene.scene import Scene, palm_of, scene_hands
 from hwp_bench.sim.subject.hand import SubjectHand, is_off_template, subject_hand
 from hwp_bench.sim.subject.subject import Subject
 
@@ -123,10 +122,8 @@ def write_truth(folder: Path, subject: Subject, sides: Sequence[str]) -> bool:
 def add_subject_mesh(capture: Capture) -> bool:
     """Write the subject's hands into a capture that was rendered before they were stored.
 
-    They follow from the scene that lies in the capture. Digests do not change.
-
-    Returns whether the capture has them now; False for other captures than simulated ones of the
-    free hand, and where the folder cannot be written to.
+    They follow from the scene that lies in the capture. Digests do not change. Returns whether the
+    capture has them now: only simulated ones of the free hand can.
     """
     path, source = capture.root / EXTRA / "scene.json", capture.info.source
     if (capture.root / TRUE_TEMPLATE).is_file():
@@ -154,17 +151,12 @@ def distances(scene: Scene) -> dict[str, TemplateDistance]:
 
 def subject_table(found: dict[str, dict[str, TemplateDistance]]) -> Table:
     """One row for each hand."""
-    rows: list[tuple[Cell, ...]] = [
-        (
-            name,
-            side,
-            item.surface,
-            *(item.mean_mm, item.most_mm, item.largest_mm, item.joints_mm),
-            item.farthest_joint_mm,
-        )
-        for name, hands in found.items()
-        for side, item in hands.items()
-    ]
+    rows: list[tuple[Cell, ...]] = []
+    for name, hands in found.items():
+        for side, item in hands.items():
+            surface = (item.mean_mm, item.most_mm, item.largest_mm)
+            joints = (item.joints_mm, item.farthest_joint_mm)
+            rows.append((name, side, item.surface, *surface, *joints))
     numbers = ("mean, mm", "95 %", "largest", "joints, mean mm", "farthest joint")
     columns = [Column(name) for name in ("scene", "hand", "surface")]
     columns += [Column(name, digits=1) for name in numbers]

@@ -16,6 +16,7 @@ from hwp_bench.sim.geometry.surface import (
     Material,
     Surface,
     albedo,
+    around_z,
     box,
     canvas,
     coat,
@@ -24,6 +25,8 @@ from hwp_bench.sim.geometry.surface import (
     join,
     picture_material,
     plain,
+    reversed_faces,
+    sheet,
     shift,
     tube,
     turned,
@@ -31,12 +34,7 @@ from hwp_bench.sim.geometry.surface import (
 from hwp_bench.sim.subject.wear import wrist_watch
 
 _BLOCK_COLORS = ((0.85, 0.16, 0.14), (0.12, 0.38, 0.80), (0.95, 0.75, 0.10), (0.15, 0.58, 0.26))
-_BLOCK_SIZES = (
-    (0.045, 0.045, 0.045),
-    (0.085, 0.042, 0.042),
-    (0.05, 0.05, 0.05),
-    (0.06, 0.04, 0.04),
-)
+_BLOCK_SIZES = ((0.045,) * 3, (0.085, 0.042, 0.042), (0.05,) * 3, (0.06, 0.04, 0.04))
 _BLOCK_PX = 128
 _BARRELS = ((0.08, 0.14, 0.55), (0.75, 0.08, 0.10), (0.05, 0.05, 0.06))
 _PHONE_SIZE = (0.07, 0.145, 0.008)
@@ -63,9 +61,9 @@ def _pen(variant: int) -> Surface:
     barrel = coat(_BARRELS[variant % len(_BARRELS)], gloss=0.25)
     rubber = plain((0.02, 0.02, 0.02), gloss=0.8)
     metal = plain((0.55, 0.55, 0.57), gloss=0.2, specular=0.6)
-    shaft = np.array([[0.0, 0.076], [0.007, 0.076], [0.0082, 0.072], [0.0084, -0.03]])
-    grip = np.array([[0.0084, -0.03], [0.009, -0.035], [0.0086, -0.052], [0.0072, -0.06]])
-    tip = np.array([[0.0072, -0.06], [0.0032, -0.07], [0.002, -0.076], [0.0, -0.0765]])
+    shaft = [(0.0, 0.076), (0.007, 0.076), (0.0082, 0.072), (0.0084, -0.03)]
+    grip = [(0.0084, -0.03), (0.009, -0.035), (0.0086, -0.052), (0.0072, -0.06)]
+    tip = [(0.0072, -0.06), (0.0032, -0.07), (0.002, -0.076), (0.0, -0.0765)]
     clip = shift(box((0.004, 0.0022, 0.045), metal), (0.0, 0.0096, 0.05))
     return join([turned(shaft, barrel), turned(grip, rubber), turned(tip, metal), clip])
 
@@ -73,9 +71,8 @@ def _pen(variant: int) -> Surface:
 def _phone(variant: int) -> Surface:
     """Build a phone, screen to +z, its top at +y; the variant scrolls the page."""
     body = box(_PHONE_SIZE, plain((0.03, 0.03, 0.035), gloss=0.3))
-    screen = Material(
-        albedo=srgb_to_linear(_page(variant)).astype(np.float32), gloss=0.12, glow=0.6
-    )
+    page = srgb_to_linear(_page(variant)).astype(np.float32)
+    screen = Material(albedo=page, gloss=0.12, glow=0.6)
     half = _PHONE_SIZE[2] / 2
     glass = shift(box((0.065, 0.136, 0.0004), screen), (0.0, 0.0, half))
     lens = box((0.024, 0.03, 0.002), plain((0.01, 0.01, 0.015), gloss=0.08))
@@ -113,8 +110,10 @@ def _sticker(variant: int) -> Surface:
     radius, angle = np.meshgrid(np.linspace(1e-3, 1.0, 4), np.linspace(0, 2 * np.pi, 33))
     place = _RADIUS * radius[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     vertices = np.concatenate([place, 0.002 * radius[..., None] ** 2], axis=-1).reshape(-1, 3)
-    back = canvas(4, 4, (0.93, 0.93, 0.93))
-    return _two_sided(vertices, _sticker_front(variant), back, columns=4)
+    front = grid(vertices, 33, 4, picture_material(_sticker_front(variant), 0.4))
+    flat = vertices[front.faces][..., :2] / (2.0 * _RADIUS) + 0.5
+    back = grid(vertices, 33, 4, picture_material(canvas(4, 4, (0.93, 0.93, 0.93)), 0.4))
+    return _two_sided(replace(front, corner_uv=flat), back)
 
 
 def _card(variant: int) -> Surface:
@@ -122,32 +121,15 @@ def _card(variant: int) -> Surface:
     x, y = np.meshgrid(np.linspace(-0.5, 0.5, 7), np.linspace(-0.5, 0.5, 7))
     z = 0.006 * (1.0 - 4.0 * x * x)
     vertices = np.stack([x * 0.058, y * 0.089, z], axis=-1).reshape(-1, 3)
-    return _two_sided(vertices, _card_front(variant), _card_back(), columns=7)
+    pictures = (_card_front(variant), _card_back())
+    return _two_sided(*(grid(vertices, 7, 7, picture_material(side, 0.4)) for side in pictures))
 
 
-def _two_sided(vertices: np.ndarray, front: np.ndarray, back: np.ndarray, columns: int) -> Surface:
-    rows = len(vertices) // columns
-    top = grid(vertices, rows, columns, picture_material(front, 0.4))
-    if columns == 4:
-        flat = vertices[top.faces][..., :2] / (2.0 * _RADIUS) + 0.5
-        top = replace(top, corner_uv=flat)
-    if top.normals[:, 2].mean() < 0:
-        top = _reversed(top)
-    under = _reversed(
-        shift(grid(vertices, rows, columns, picture_material(back, 0.4)), (0.0, 0.0, -0.0004))
-    )
-    if under.normals[:, 2].mean() > 0:
-        under = _reversed(under)
-    return join([top, under])
-
-
-def _reversed(surface: Surface) -> Surface:
-    return replace(
-        surface,
-        faces=np.ascontiguousarray(surface.faces[:, ::-1]),
-        corner_uv=np.ascontiguousarray(surface.corner_uv[:, ::-1]),
-        normals=-surface.normals,
-    )
+def _two_sided(front: Surface, back: Surface) -> Surface:
+    """Two like sheets, the back below the front and turned away from +z."""
+    top = reversed_faces(front) if front.normals[:, 2].mean() < 0 else front
+    under = reversed_faces(shift(back, (0.0, 0.0, -0.0004)))
+    return join([top, reversed_faces(under) if under.normals[:, 2].mean() > 0 else under])
 
 
 def _sticker_front(variant: int) -> np.ndarray:
@@ -203,13 +185,8 @@ def _pip(
         for dx in (-0.45, 0.45):
             center = (int(x + dx * size), int(y - sign * 0.3 * size))
             cv2.circle(image, center, int(0.5 * size), color, -1, cv2.LINE_AA)
-        corners = np.array(
-            [
-                [x - 0.9 * size, y - sign * 0.12 * size],
-                [x + 0.9 * size, y - sign * 0.12 * size],
-                [x, y + sign * size],
-            ]
-        )
+        wide, high = 0.9 * size, y - sign * 0.12 * size
+        corners = np.array([[x - wide, high], [x + wide, high], [x, y + sign * size]])
         cv2.fillPoly(image, [corners.astype(np.int32)], color, cv2.LINE_AA)
     if suit in ("spade", "club"):
         foot = np.array([[x, y], [x - 0.35 * size, y + size], [x + 0.35 * size, y + size]])
@@ -238,21 +215,12 @@ def _tube(variant: int) -> Surface:
     label[70:100] = ink((0.20, 0.55, 0.62))
     cv2.putText(label, "care", (22, 52), cv2.FONT_HERSHEY_DUPLEX, 1.2, ink((0.1, 0.3, 0.4)), 3)
     skin = picture_material(label, 0.3)
-    ticks = np.linspace(0.0, 1.0, 12)
+    ticks = np.linspace(0.0, 1.0, 12)[:, None]
     angles = np.linspace(0.0, 2.0 * np.pi, 33)
-    radius = 0.019
-    flat = 1.0 - 0.93 * ticks**1.5
-    wide = 1.0 + 0.25 * ticks**1.5
-    vertices = np.stack(
-        [
-            radius * wide[:, None] * np.cos(angles),
-            radius * flat[:, None] * np.sin(angles),
-            np.broadcast_to((-0.05 + 0.12 * ticks)[:, None], (len(ticks), len(angles))),
-        ],
-        axis=-1,
-    ).reshape(-1, 3)
+    wide, flat = 1.0 + 0.25 * ticks**1.5, 1.0 - 0.93 * ticks**1.5
+    vertices = around_z(0.019 * wide, -0.05 + 0.12 * ticks, angles, tall=0.019 * flat)
     cap = coat((0.15, 0.42, 0.5), gloss=0.35)
-    lid = np.array([[0.0, -0.072], [0.016, -0.072], [0.0165, -0.052], [0.019, -0.05]])
+    lid = [(0.0, -0.072), (0.016, -0.072), (0.0165, -0.052), (0.019, -0.05)]
     return join([grid(vertices, len(ticks), len(angles), skin), turned(lid, cap)])
 
 
@@ -260,29 +228,16 @@ def _dollop(variant: int) -> Surface:
     """A dollop of cream about 4 cm wide."""
     rng = generator(11, "dollop", variant)
     cream = plain((0.88, 0.87, 0.84), gloss=0.28, specular=0.05)
-    profile_at = np.linspace(0.0, 1.0, 9)
+    through = np.linspace(0.0, 1.0, 9)[:, None]
     angles = np.linspace(0.0, 2.0 * np.pi, 33)
     waves = sum(
         rng.normal(0.0, 0.18 / k) * np.cos(k * angles + rng.uniform(0, 6.3)) for k in (2, 3, 5)
     )
-    radius = 0.02 * (1.0 + waves)
-    profile = np.sin(profile_at * np.pi / 2)
-    height = 0.006 * np.cos(profile_at * np.pi / 2) ** 0.7
-    swirl = (
-        0.0012 * np.sin(3 * angles[None] + 9.0 * profile_at[:, None]) * (1 - profile_at[:, None])
-    )
-    vertices = np.stack(
-        [
-            profile[:, None] * radius * np.cos(angles),
-            profile[:, None] * radius * np.sin(angles),
-            height[:, None] + swirl - 0.0015,
-        ],
-        axis=-1,
-    ).reshape(-1, 3)
-    sheet = grid(vertices, len(profile_at), len(angles), cream)
-    if sheet.normals[:, 2].mean() < 0:
-        sheet = grid(vertices, len(profile_at), len(angles), cream, flip=True)
-    return sheet
+    radius = np.sin(through * np.pi / 2) * (0.02 * (1.0 + waves))
+    swirl = 0.0012 * np.sin(3 * angles + 9.0 * through) * (1 - through)
+    height = 0.006 * np.cos(through * np.pi / 2) ** 0.7 + swirl - 0.0015
+    vertices = around_z(radius, height, angles)
+    return sheet(vertices, len(through), len(angles), cream, np.array([0.0, 0.0, 1.0]))
 
 
 def _watch(variant: int) -> Surface:
@@ -307,12 +262,11 @@ def _mug(variant: int) -> Surface:
         cv2.circle(image, place, int(rng.integers(3, 9)), ink(band), -1, cv2.LINE_AA)
     glaze = picture_material(image, 0.18)
     inside = coat((0.93, 0.92, 0.88), gloss=0.2)
-    outer = np.array([[0.0, -0.045], [0.034, -0.045], [0.039, -0.04], [0.041, 0.043]])
-    inner = np.array([[0.041, 0.043], [0.038, 0.045], [0.0365, 0.04], [0.034, -0.038], [0, -0.04]])
+    outer = [(0.0, -0.045), (0.034, -0.045), (0.039, -0.04), (0.041, 0.043)]
+    inner = [(0.041, 0.043), (0.038, 0.045), (0.0365, 0.04), (0.034, -0.038), (0.0, -0.04)]
     bend = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 15)
-    spine = np.stack(
-        [0.039 + 0.026 * np.cos(bend), np.zeros_like(bend), 0.027 * np.sin(bend)], axis=1
-    )
+    bow = (0.039 + 0.026 * np.cos(bend), np.zeros_like(bend), 0.027 * np.sin(bend))
+    spine = np.stack(bow, axis=1)
     handle = tube(spine, np.full(len(spine), 0.0055), glaze)
     return join([turned(outer, glaze, 40), turned(inner, inside, 40), handle])
 
@@ -386,12 +340,8 @@ def _remote(variant: int) -> Surface:
             cv2.circle(face, (14 + 18 * column, 128 + 22 * row), 6, key, -1, cv2.LINE_AA)
     shell = coat((0.07,) * 3 if dark else (0.72,) * 3, gloss=0.4)
     top = picture_material(face[::-1], 0.5)
-    return join(
-        [
-            box((0.045, 0.16, 0.018), shell),
-            shift(box((0.042, 0.156, 0.001), top), (0.0, 0.0, 0.0095)),
-        ]
-    )
+    keys = shift(box((0.042, 0.156, 0.001), top), (0.0, 0.0, 0.0095))
+    return join([box((0.045, 0.16, 0.018), shell), keys])
 
 
 def _bottle(variant: int) -> Surface:
@@ -404,17 +354,9 @@ def _bottle(variant: int) -> Surface:
     cv2.putText(label, "No. 7", (20, 78), cv2.FONT_HERSHEY_DUPLEX, 1.4, ink((0.97, 0.95, 0.9)), 3)
     body = picture_material(label[::-1], 0.22)
     cap = coat((0.15, 0.15, 0.16), gloss=0.4)
-    hull = np.array(
-        [
-            [0.0, -0.08],
-            [0.024, -0.08],
-            [0.027, -0.075],
-            [0.027, 0.035],
-            [0.022, 0.052],
-            [0.01, 0.062],
-        ]
-    )
-    lid = np.array([[0.012, 0.06], [0.0125, 0.082], [0.011, 0.085], [0.0, 0.085]])
+    hull = [(0.0, -0.08), (0.024, -0.08), (0.027, -0.075), (0.027, 0.035)]
+    hull += [(0.022, 0.052), (0.01, 0.062)]
+    lid = [(0.012, 0.06), (0.0125, 0.082), (0.011, 0.085), (0.0, 0.085)]
     return join([turned(hull, body, 36), turned(lid, cap)])
 
 
@@ -447,14 +389,9 @@ def _notebook(variant: int) -> Surface:
     cover[:, 14:18] = ink((0.08, 0.08, 0.09))
     pages = coat((0.92, 0.90, 0.84), gloss=0.8)
     lid = picture_material(np.ascontiguousarray(cover[::-1]), 0.5)
-    back = coat(color, gloss=0.5)
-    return join(
-        [
-            box((0.088, 0.138, 0.011), pages),
-            shift(box((0.09, 0.14, 0.001), lid), (0.0, 0.0, 0.006)),
-            shift(box((0.09, 0.14, 0.001), back), (0.0, 0.0, -0.006)),
-        ]
-    )
+    sides = ((lid, 0.006), (coat(color, gloss=0.5), -0.006))
+    covers = [shift(box((0.09, 0.14, 0.001), side), (0.0, 0.0, z)) for side, z in sides]
+    return join([box((0.088, 0.138, 0.011), pages), *covers])
 
 
 # What builds each object; the variant chooses among its colours, sizes and pictures.
@@ -488,11 +425,8 @@ def object_names() -> tuple[str, ...]:
 def check_object(name: str) -> None:
     """Refuse an object that does not exist."""
     if name not in _BUILDERS:
-        raise BadInput(
-            f"there is no object {name!r}",
-            field="object",
-            remedy=f"Known: {', '.join(_BUILDERS)}.",
-        )
+        known = f"Known: {', '.join(_BUILDERS)}."
+        raise BadInput(f"there is no object {name!r}", field="object", remedy=known)
 
 
 @lru_cache(maxsize=64)

@@ -1,4 +1,4 @@
-"""A scene: what a simulated capture shows, as checked data.
+"""A scene: what a simulated capture shows, as checked data, and its state at any time.
 
 World and camera share OpenCV axes at the start: x right, y down, z away from the camera.
 Times inside a capture are fractions of it (0 = first frame, 1 = last), so that the same scene
@@ -7,25 +7,31 @@ renders at any number of frames.
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from dataclasses import MISSING, asdict, dataclass, field, fields, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from msgspec import Meta
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import sha256_json
 from hwp_bench.base.records import Seed, number
-from hwp_bench.hands.poses import gesture
+from hwp_bench.hands.poses import finger_pose, gesture, mirrored, within_limits
+from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.sim.geometry.noise import generator
-from hwp_bench.sim.light.lights import Light
+from hwp_bench.sim.geometry.surface import ease, rigid
+from hwp_bench.sim.light.lights import Light, focus_point
 from hwp_bench.sim.props.behind import NOTHING, Behind
 from hwp_bench.sim.sensor import NOISELESS, Sensor
-from hwp_bench.sim.subject.subject import Subject, Words
+from hwp_bench.sim.subject.hand import FINE, SubjectHand, subject_hand
+from hwp_bench.sim.subject.subject import Subject, Words, without_defaults
 from hwp_bench.taxonomy import MAX_SEVERITY
 
 #: Version of the scene format; part of every scene digest.
 SCHEMA = "hwp-scene/1"
+#: Share of an episode in which it rises, and in which it falls.
+RAMP = 0.2
 #: Where the clean part of a capture begins, as a fraction: nothing is perturbed from here on.
 CLEAN_FROM = 0.8
 #: Share of the training frames that must stay unperturbed.
@@ -113,6 +119,13 @@ class Episode:
     #: Severity in its middle, 1-5; it rises and falls at the ends.
     severity: float
 
+    def rise(self, moment: float) -> float | None:
+        """How far a moment lies inside of the nearer end, in lengths of `RAMP`; None outside."""
+        if not self.start <= moment <= self.end:
+            return None
+        through = (moment - self.start) / (self.end - self.start)
+        return min(through, 1.0 - through) / RAMP
+
 
 @dataclass(frozen=True)
 class EffectCall:
@@ -184,7 +197,13 @@ class Scene:
             self.sensor, ("noise", "jpeg_quality", "rolling_shutter")
         )
         content["light"] = without_defaults(self.light, ("direction", "key", "sky", "kelvin"))
-        content["subject"] = _subject_json(self.subject)
+        subject = self.subject
+        content["subject"] = without_defaults(subject, ("seed", "tone", "age", "sleeve", "model"))
+        content["subject"].pop("looks", None)
+        if looks := without_defaults(subject.looks):
+            content["subject"]["looks"] = looks
+        if subject.anatomy is not None:
+            content["subject"]["anatomy"] = without_defaults(subject.anatomy)
         track = content["track"]
         content["track"] = {
             "period": track["period"],
@@ -213,14 +232,11 @@ def with_severity(scene: Scene, severity: float) -> Scene:
     """The scene with every episode at one severity."""
     if not 1 <= severity <= MAX_SEVERITY:
         raise UsageError(f"{severity} is not in 1..{MAX_SEVERITY}", field="severity")
-    effects = tuple(
-        replace(
-            call,
-            episodes=tuple(replace(part, severity=float(severity)) for part in call.episodes),
-        )
-        for call in scene.effects
-    )
-    return replace(scene, effects=effects)
+    effects = []
+    for call in scene.effects:
+        episodes = tuple(replace(part, severity=float(severity)) for part in call.episodes)
+        effects.append(replace(call, episodes=episodes))
+    return replace(scene, effects=tuple(effects))
 
 
 def with_subject(scene: Scene, seed: int) -> Scene:
@@ -245,24 +261,212 @@ def with_effects(scene: Scene, kinds: Collection[str]) -> Scene:
     return replace(scene, effects=tuple(call for call in scene.effects if call.kind in kinds))
 
 
-def without_defaults(record: Any, keep: tuple[str, ...]) -> dict[str, Any]:
-    """Return a record as JSON values, without fields that say what they say by default."""
-    content = asdict(record)
-    for item in fields(record):
-        default = item.default
-        if default is MISSING and item.default_factory is not MISSING:
-            default = item.default_factory()
-        if item.name not in keep and getattr(record, item.name) == default:
-            del content[item.name]
-    return content
+#: A level below this rounds to severity 0: the effect is absent.
+ACTIVE_FROM = 0.5
+# Moments at which the share of clean frames is measured.
+_PROBES = 2001
 
 
-def _subject_json(subject: Subject) -> dict[str, Any]:
-    """A subject as JSON values, without later fields that change nothing."""
-    content = without_defaults(subject, ("seed", "tone", "age", "sleeve", "model"))
-    content.pop("looks", None)
-    if looks := subject.looks.to_json():
-        content["looks"] = looks
-    if subject.anatomy is not None:
-        content["anatomy"] = without_defaults(subject.anatomy, ())
-    return content
+def level(call: EffectCall, moment: float) -> float:
+    """How strongly an effect acts at one moment: 0, or from `ACTIVE_FROM` to 5."""
+    rises = ((part.rise(moment), part.severity) for part in call.episodes)
+    levels = (min(1.0, 0.35 + 0.65 * rise) * most for rise, most in rises if rise is not None)
+    strongest = max(levels, default=0.0)
+    return strongest if strongest >= ACTIVE_FROM else 0.0
+
+
+def envelope(call: EffectCall, moment: float) -> float:
+    """How far into an episode a moment is: 0 at its ends, 1 from `RAMP` on, smooth between."""
+    rises = (part.rise(moment) for part in call.episodes)
+    return float(ease(next((rise for rise in rises if rise is not None), 0.0)))
+
+
+def severity(call: EffectCall, moment: float) -> int:
+    """Severity that is written into the capture: the level rounded to an integer, 0-5."""
+    return int(np.floor(level(call, moment) + 0.5))
+
+
+def moments(frame_count: int) -> np.ndarray:
+    """Moment of every frame as a fraction of the capture: (F,) in [0, 1)."""
+    return np.arange(frame_count) / frame_count
+
+
+def clean_share(scene: Scene) -> float:
+    """Share of the training part in which no effect acts."""
+    probes = np.linspace(0.0, CLEAN_FROM, _PROBES)
+    acting = [any(level(call, moment) for call in scene.effects) for moment in probes]
+    return 1.0 - float(np.mean(acting))
+
+
+# Share of the way from key to key in which the hand rests at the key.
+_DWELL = 0.3
+# Slow wander on top of the keys: metres, and degrees of turn, tilt and roll.
+_WANDER_PLACE = 0.006
+_WANDER_ANGLE = 3.0
+
+
+@dataclass(frozen=True)
+class HandMoment:
+    """One hand at one instant, in anatomical terms."""
+
+    #: (5, 4) degrees, as in `gestures.toml`.
+    angles: np.ndarray
+    #: (3,) m, centre of the palm in the world relative to the point looked at.
+    place: np.ndarray
+    #: (3,) degrees: turn, tilt, roll, as in `HandKey`.
+    heading: np.ndarray
+
+    def blend(self, other: HandMoment, weight: float) -> HandMoment:
+        """Return the moment `weight` of the way to another."""
+        return HandMoment(
+            angles=self.angles + weight * (other.angles - self.angles),
+            place=self.place + weight * (other.place - self.place),
+            heading=self.heading + weight * (other.heading - self.heading),
+        )
+
+
+def moment_of_key(key: HandKey) -> HandMoment:
+    """Return the moment that a key describes."""
+    return HandMoment(
+        angles=gesture(key.gesture),
+        place=np.array(key.place),
+        heading=np.array([key.turn, key.tilt, key.roll]),
+    )
+
+
+def along_keys(
+    keys: list[HandMoment], phase: float, scene: Scene, label: str, variation: float
+) -> HandMoment:
+    """State of a repeating row of keys at `phase` (one key per unit), varied in every round."""
+    index = int(np.floor(phase))
+    before = _varied(keys[index % len(keys)], scene, label, index, variation)
+    after = _varied(keys[(index + 1) % len(keys)], scene, label, index + 1, variation)
+    x = min(max((phase - index - _DWELL / 2) / (1.0 - _DWELL), 0.0), 1.0)
+    # Zero speed and acceleration at both ends: 6x^5 - 15x^4 + 10x^3.
+    return before.blend(after, x * x * x * (x * (6.0 * x - 15.0) + 10.0))
+
+
+def _varied(key: HandMoment, scene: Scene, label: str, index: int, variation: float) -> HandMoment:
+    rng = generator(scene.seed, "key", label, index)
+    angles = key.angles + rng.normal(0.0, variation, key.angles.shape)
+    place = key.place + rng.normal(0.0, 0.004, 3)
+    return HandMoment(angles, place, key.heading + rng.normal(0.0, variation, 3))
+
+
+def track_moment(scene: Scene, side: str, seconds: float) -> HandMoment:
+    """One hand of the undisturbed track at a time."""
+    keys = [moment_of_key(key) for key in scene.track.keys[side]]
+    phase = seconds / scene.track.period * len(keys)
+    moment = along_keys(keys, phase, scene, side, scene.track.variation)
+    rng = generator(scene.seed, "wander", side)
+    rates = rng.uniform(0.5, 1.4, 6)
+    waves = np.sin(rates * seconds * 2.0 + rng.uniform(0.0, 2.0 * np.pi, 6))
+    return HandMoment(
+        angles=within_limits(moment.angles),
+        place=moment.place + _WANDER_PLACE * waves[:3],
+        heading=moment.heading + _WANDER_ANGLE * waves[3:],
+    )
+
+
+def heading_matrix(heading: np.ndarray, side: str) -> np.ndarray:
+    """Rotation from the template's rest frame to the world: (3, 3).
+
+    At zero heading the fingers point up and the back of the hand faces the camera.
+    """
+    from scipy.spatial.transform import Rotation
+
+    mirror = 1.0 if side == "right" else -1.0
+    # Columns: where rest x, y, z go. Right: fingers -x to -y, back +y to -z (to the camera).
+    base = np.array([[0.0, 0.0, -mirror], [mirror, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    turn, tilt, roll = heading
+    rotation = Rotation.from_euler("yxz", [mirror * turn, -tilt, roll], degrees=True)
+    return rotation.as_matrix() @ base
+
+
+def palm_of(joints: np.ndarray) -> np.ndarray:
+    """The middle of the palm of a hand at rest, which keys place: (3,) m."""
+    return 0.35 * joints[0] + 0.65 * joints[4]
+
+
+def hand_parameters(
+    moment: HandMoment, side: str, joints: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Turn a moment into the hand model's pose, (16, 3) axis-angle rad, and translation, (3,) m.
+
+    Takes `joints` (16, 3) rest joints of that side with the subject's shape.
+    """
+    from scipy.spatial.transform import Rotation
+
+    right_joints = joints if side == "right" else joints * np.array([-1.0, 1.0, 1.0])
+    fingers = finger_pose(moment.angles, right_joints)
+    if side == "left":
+        fingers = mirrored(fingers)
+    turn = heading_matrix(moment.heading, side)
+    palm = palm_of(joints)
+    transl = focus_point() + moment.place - joints[0] - turn @ (palm - joints[0])
+    return np.vstack([Rotation.from_matrix(turn).as_rotvec(), fingers]), transl
+
+
+def scene_hands(scene: Scene, subdivisions: int = FINE) -> dict[str, SubjectHand]:
+    """The subject's hands that a scene shows, by side."""
+    return {side: subject_hand(scene.subject, side, subdivisions) for side in scene.sides}
+
+
+def intrinsics(scene: Scene, size: int) -> np.ndarray:
+    """(3, 3) K in pixels of a square image."""
+    focal = 0.5 * size / np.tan(np.radians(scene.camera.field_of_view) / 2.0)
+    return np.array([[focal, 0.0, size / 2], [0.0, focal, size / 2], [0.0, 0.0, 1.0]])
+
+
+def viewmat(scene: Scene, seconds: float) -> np.ndarray:
+    """(4, 4) world to camera; a camera that stands still has the identity."""
+    if not scene.camera.handheld:
+        return np.eye(4)
+    from scipy.spatial.transform import Rotation
+
+    rng = generator(scene.seed, "camera")
+    rates = rng.uniform(0.4, 2.2, (2, 6))
+    phases = rng.uniform(0.0, 2.0 * np.pi, (2, 6))
+    waves = np.sin(rates * seconds + phases)
+    waves = 0.7 * waves[0] + 0.3 * waves[1]
+    turn, focus = Rotation.from_rotvec(0.012 * waves[:3]).as_matrix(), focus_point()
+    # The camera sways around the point that it looks at.
+    return rigid(turn, focus - turn @ focus - scene.camera.sway * waves[3:])
+
+
+def pixel_rays(
+    K: np.ndarray,
+    view: np.ndarray,
+    box: tuple[int, int, int, int],
+    grid: int,
+    shift: tuple[float, float] = (0.0, 0.0),
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rays through a regular grid inside every pixel: origin (3,) and directions, world.
+
+    Directions (rows * grid, columns * grid, 3) have length 1 along the camera's axis.
+    """
+    top, bottom, left, right = box
+    across = left + (np.arange((right - left) * grid) + 0.5 + shift[0]) / grid
+    down = top + (np.arange((bottom - top) * grid) + 0.5 + shift[1]) / grid
+    x, y = np.meshgrid((across - K[0, 2]) / K[0, 0], (down - K[1, 2]) / K[1, 1])
+    in_camera = np.stack([x, y, np.ones_like(x)], axis=-1)
+    turn = view[:3, :3]
+    return -turn.T @ view[:3, 3], in_camera @ turn
+
+
+def parameters_of(
+    scene: Scene,
+    moments: Sequence[Mapping[str, HandMoment]],
+    betas: Mapping[str, np.ndarray] | None = None,
+) -> dict[str, HandParameters]:
+    """Hand parameters of every frame, by side, with these betas (10,) or the true ones."""
+    found = {}
+    for side, subject in scene_hands(scene).items():
+        shape, joints = subject.betas, subject.model_joints
+        if betas is not None:
+            shape = betas[side]
+            joints = subject.model.joints + subject.model.joint_basis @ shape
+        rows = [hand_parameters(hands[side], side, joints) for hands in moments]
+        pose, transl = (np.stack(parts) for parts in zip(*rows, strict=True))
+        found[side] = HandParameters(pose, shape, transl, np.ones(len(moments), dtype=bool))
+    return found

@@ -1,7 +1,8 @@
-"""What leads away from the wrist: a sleeve, or a bare forearm in one piece with the hand.
+"""What a subject's hands carry: a sleeve or a bare forearm, rings, watches and bracelets.
 
 The forearm's first ring is the hand's own rim, its paint is the hand's painter at places behind
-the wrist, and both share the normals at the rim, so that no seam shows.
+the wrist, and both share the normals at the rim, so that no seam shows. What is worn is fitted to
+the rest hand and carried by the posed one.
 """
 
 from __future__ import annotations
@@ -13,13 +14,44 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hwp_bench.base.colors import srgb_to_linear
+from hwp_bench.hands.poses import FIRST_JOINT, finger_back
 from hwp_bench.hands.template import boundary_loop
 from hwp_bench.sim.geometry.noise import fractal_noise, generator
-from hwp_bench.sim.geometry.surface import Material, Surface, normal_operator, surface_normals, unit
-from hwp_bench.sim.subject.atlas import SkinAtlas, kept
-from hwp_bench.sim.subject.hand import FINE, subject_hand
-from hwp_bench.sim.subject.skin import of_side, painted
+from hwp_bench.sim.geometry.surface import (
+    Material,
+    Surface,
+    best_turn,
+    ease,
+    join,
+    perpendicular,
+    plain,
+    reversed_faces,
+    rigid,
+    shape,
+    transformed,
+    unit,
+)
+from hwp_bench.sim.subject.hand import (
+    FINE,
+    SubjectHand,
+    kept,
+    of_side,
+    painted,
+    skin_material,
+    subject_hand,
+)
 from hwp_bench.sim.subject.subject import Subject
+from hwp_bench.sim.subject.wear import (
+    UPRIGHT,
+    Ring,
+    WristWear,
+    angles,
+    band,
+    beads,
+    metal,
+    stone,
+    wrist_watch,
+)
 
 if TYPE_CHECKING:
     from hwp_bench.hands import HandTemplate
@@ -31,10 +63,10 @@ def ringed(
     along: np.ndarray,
     material: Material,
 ) -> Surface:
-    """Join rings behind one another to a surface that looks outward and is not a hand.
+    """Join rings (R * K, 3) behind one another to a surface that looks outward and is not a hand.
 
-    Takes `vertices` (R * K, 3) m, `around` (K,) texture coordinate of each vertex of a ring,
-    `along` (R,) texture coordinate of each ring.
+    Takes texture coordinates, `around` of each vertex of a ring (K,) and of the next one, and
+    `along` of each ring (R,).
     """
     count, spokes = len(along), len(around[0])
     ring, spoke = np.meshgrid(np.arange(count - 1), np.arange(spokes), indexing="ij")
@@ -44,23 +76,14 @@ def ringed(
     faces = np.concatenate([np.stack([a, c, b], axis=1), np.stack([b, c, d], axis=1)])
     left, right = (side[spoke.ravel()] for side in around)
     near, far = (along[ring.ravel() + step] for step in (0, 1))
-    uv_a, uv_b = np.stack([left, near], 1), np.stack([right, near], 1)
-    uv_c, uv_d = np.stack([left, far], 1), np.stack([right, far], 1)
-    corner_uv = np.concatenate([np.stack([uv_a, uv_c, uv_b], 1), np.stack([uv_b, uv_c, uv_d], 1)])
-    normals = surface_normals(vertices, faces, normal_operator(faces, len(vertices)))
+    uv = [np.stack(at, axis=1) for at in ((left, near), (right, near), (left, far), (right, far))]
+    halves = [np.stack([uv[corner] for corner in half], 1) for half in ((0, 2, 1), (1, 2, 3))]
+    corner_uv = np.concatenate(halves)
+    made = shape(vertices, faces, corner_uv, material, smooth=True)
     middles = vertices.reshape(count, spokes, 3).mean(axis=1)
     outward = vertices - np.repeat(middles, spokes, axis=0)
-    if np.einsum("ni,ni->n", normals, outward).sum() < 0:
-        faces, corner_uv, normals = faces[:, ::-1], corner_uv[:, ::-1], -normals
-    return Surface(
-        vertices=vertices,
-        normals=normals,
-        faces=np.ascontiguousarray(faces),
-        corner_uv=np.ascontiguousarray(corner_uv),
-        material=np.zeros(len(faces), dtype=np.int64),
-        materials=(material,),
-        hand=np.zeros(len(faces), dtype=bool),
-    )
+    looks_in = np.einsum("ni,ni->n", made.normals, outward).sum() < 0
+    return reversed_faces(made) if looks_in else made
 
 
 # Rings along the arm, m behind the wrist's rim; the first two make the cuff's fold.
@@ -95,12 +118,9 @@ def wrist_rim(template: HandTemplate) -> np.ndarray:
 
 
 def sleeve(rim: np.ndarray, forward: np.ndarray, elbow: np.ndarray, material: Material) -> Surface:
-    """Build a sleeve from the rim of a posed wrist towards the elbow.
-
-    Takes `rim` (R, 3) m, `forward` (3,) unit vector from the wrist to the fingers, `elbow` (3,) m.
-    """
+    """Build a sleeve from the rim (R, 3) of a posed wrist towards the elbow."""
     center = rim.mean(axis=0)
-    side = unit(rim[0] - center - ((rim[0] - center) @ forward) * forward)
+    side = perpendicular(rim[0] - center, forward)
     third = np.cross(forward, side)
     angles = np.arctan2((rim - center) @ third, (rim - center) @ side)
     order = np.argsort(angles)
@@ -116,7 +136,7 @@ def sleeve(rim: np.ndarray, forward: np.ndarray, elbow: np.ndarray, material: Ma
         heading = unit(-forward + bend * (arm + forward))
         place = center + back * -forward if step < 4 else place + (back - previous) * heading
         previous = back
-        x = unit(side - (side @ heading) * heading)
+        x = perpendicular(side, heading)
         y = np.cross(x, heading)
         if y @ third < 0:
             y = -y
@@ -175,11 +195,7 @@ def wrist_loop(subject: Subject, side: str, subdivisions: int = FINE) -> Rim:
 def forearm(
     rim: np.ndarray, around: np.ndarray, forward: np.ndarray, elbow: np.ndarray, skin: Material
 ) -> Surface:
-    """Build an arm from the rim of a posed wrist towards the elbow.
-
-    Takes `rim` (K, 3) m, `around` (K,) `Rim.around`, `forward` (3,) unit vector from the wrist to
-    the fingers, `elbow` (3,) m.
-    """
+    """Build an arm from the rim (K, 3) of a posed wrist towards the elbow."""
     vertices = _arm_rings(rim, forward, elbow)
     # From the middle of the first row of texels to that of the last: textures repeat beyond.
     rows = _ARM_TEXELS[0]
@@ -189,10 +205,7 @@ def forearm(
 
 
 def seamless(hand: Surface, arm: Surface, loop: np.ndarray) -> tuple[Surface, Surface]:
-    """Hand and arm with common normals where they meet.
-
-    Takes `loop` (K,) `Rim.loop`.
-    """
+    """Hand and arm with common normals where they meet, at the rim's `loop`."""
     common = unit(hand.normals[loop] + arm.normals[: len(loop)])
     of_hand, of_arm = hand.normals.copy(), arm.normals.copy()
     of_hand[loop] = common
@@ -222,12 +235,12 @@ def rest_arm(subject: Subject, side: str, subdivisions: int = FINE) -> np.ndarra
     return _arm_rings(rim, forward, rim.mean(axis=0) - forward)
 
 
-@lru_cache(maxsize=2)
-def arm_atlas(subject: Subject) -> SkinAtlas:
+@lru_cache(maxsize=4)
+def arm_atlas(subject: Subject) -> Material:
     """Paint the forearm of a subject, or read it from the cache."""
     hand = subject_hand(subject, "right")
 
-    def paint() -> SkinAtlas:
+    def paint() -> Material:
         rim = wrist_loop(subject, "right")
         vertices = rest_arm(subject, "right")
         arm = forearm(
@@ -243,11 +256,8 @@ def arm_atlas(subject: Subject) -> SkinAtlas:
         weights[:, 0] = 1.0
         anatomy = hand.anatomy(points, normals, weights)
         skin = painted(anatomy, of_side(subject, "right"), fine=True)
-        albedo, height, roughness = (
-            np.ascontiguousarray(values.reshape(*_ARM_TEXELS, *values.shape[1:]), dtype=np.float32)
-            for values in (skin.albedo, skin.height, skin.roughness)
-        )
-        return SkinAtlas(albedo, height, roughness)
+        parts = (skin.albedo, skin.height, skin.roughness)
+        return skin_material(*(part.reshape(*_ARM_TEXELS, *part.shape[1:]) for part in parts))
 
     return kept(hand, subject, f"arm {_ARM_TEXELS}", paint)
 
@@ -287,15 +297,12 @@ def _arm_rings(rim: np.ndarray, forward: np.ndarray, elbow: np.ndarray) -> np.nd
     widths = PchipInterpolator(_ARM_PLACES, _ARM_WIDTHS)
     rings, place, previous, heading = [], center, 0.0, -forward
     for back in _RING_PLACES:
-        bend = min(back / _BEND, 1.0)
-        turn = bend * bend * (3.0 - 2.0 * bend)
-        ahead = unit(-forward + turn * (arm + forward))
+        ahead = unit(-forward + ease(back / _BEND) * (arm + forward))
         x, y = _carried(x, heading, ahead), _carried(y, heading, ahead)
         heading = ahead
         place = place + (back - previous) * heading
         previous = back
-        settled = min(back / _SETTLE, 1.0)
-        settled = settled * settled * (3.0 - 2.0 * settled)
+        settled = ease(back / _SETTLE)
         size = float(widths(back))
         # A forearm gets rounder towards the elbow.
         tall = high + np.interp(back, (0.05, 0.25), (0.0, 0.75)) * (wide - high)
@@ -315,4 +322,134 @@ def _carried(axis: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndar
     cross, cosine = np.cross(before, after), float(before @ after)
     turned = axis + np.cross(cross, axis)
     turned = turned + np.cross(cross, np.cross(cross, axis)) / max(1.0 + cosine, 1e-9)
-    return unit(turned - (turned @ after) * after)
+    return perpendicular(turned, after)
+
+
+# Where a ring sits on the first bone, as a share of it.
+_ON_BONE = {"thumb": 0.5}
+_ON_FINGER = 0.66
+# Half the width of the skin that a band is fitted to, m, and the air below it.
+_BELT, _AIR = 0.003, 0.0003
+_THICKNESS = 0.0014
+# Where a wrist is worn on, m in front of the rim: with a sleeve, and on a bare arm.
+_BEFORE_SLEEVE = {"watch": 0.0155, "bangle": 0.009, "beads": 0.010}
+_ON_ARM = {"watch": -0.020, "bangle": -0.014, "beads": -0.016}
+
+
+@dataclass(frozen=True, eq=False)
+class Mount:
+    """A worn thing on the rest hand, and the skin that carries it."""
+
+    #: The thing, fitted to the rest hand.
+    thing: Surface
+    #: (N,) vertices of hand or arm around it.
+    near: np.ndarray
+    #: (N, 3) m, where they are at rest.
+    places: np.ndarray
+    #: Whether the arm carries it.
+    on_arm: bool
+
+    def carried(self, vertices: np.ndarray) -> Surface:
+        """The thing on the posed hand (or arm), moved by the best rigid motion of its skin."""
+        now = vertices[self.near]
+        middle, place = self.places.mean(axis=0), now.mean(axis=0)
+        turn = best_turn(self.places - middle, now - place)
+        return transformed(self.thing, rigid(turn, place - turn @ middle))
+
+
+@lru_cache(maxsize=8)
+def ring_mounts(subject: Subject, side: str) -> tuple[Mount, ...]:
+    """The rings of one hand; they count as hand."""
+    looks = of_side(subject, side).looks
+    if not looks.rings:
+        return ()
+    hand = subject_hand(subject, side)
+    return tuple(_ring_mount(hand, ring) for ring in looks.rings)
+
+
+@lru_cache(maxsize=8)
+def wrist_mounts(subject: Subject, side: str, subdivisions: int) -> tuple[Mount, ...]:
+    """Watch and bracelets of one wrist."""
+    looks = of_side(subject, side).looks
+    return tuple(_wrist_mount(subject, side, item, subdivisions) for item in looks.wrist)
+
+
+def _ring_mount(hand: SubjectHand, ring: Ring) -> Mount:
+    mirror = np.array([1.0 if hand.template.side == "right" else -1.0, 1.0, 1.0])
+    first = FIRST_JOINT[ring.finger]
+    start = first + (1 if ring.finger == "thumb" else 0)
+    bone = unit(hand.joints[start + 1] - hand.joints[start])
+    share = _ON_BONE.get(ring.finger, _ON_FINGER)
+    place = hand.joints[start] + share * (hand.joints[start + 1] - hand.joints[start])
+    axis = perpendicular(finger_back(ring.finger) * mirror, bone)
+    frame = np.stack([np.cross(axis, bone), axis, bone], axis=1)
+    rest = hand.rest_skin
+    owned = hand.lift @ hand.template.weights[:, first : first + 3].sum(axis=1) > 0.5
+    local = (rest - place) @ frame
+    belt = owned & (np.abs(local[:, 2]) < 0.5 * ring.width + _BELT)
+    middle = 0.5 * (local[belt, :2].max(axis=0) + local[belt, :2].min(axis=0))
+    place = place + frame[:, :2] @ middle
+    outline = _outline(local[belt, :2] - middle) + _AIR
+    material = metal(ring.metal)
+    parts = [band(outline, ring.width, _THICKNESS, material)]
+    if ring.stone:
+        top = np.interp(0.5 * np.pi, angles(), outline) + _THICKNESS
+        gem = stone(ring.stone, ring.stone_color, material)
+        parts.append(transformed(gem, rigid(UPRIGHT, (0.0, top, 0.0))))
+    count = len(hand.template.vertices)
+    near = np.flatnonzero(owned[:count] & (np.abs(local[:count, 2]) < 0.007))
+    return Mount(_placed(join(parts), frame, place, hand=True), near, rest[near], on_arm=False)
+
+
+def _wrist_mount(subject: Subject, side: str, item: WristWear, subdivisions: int) -> Mount:
+    hand = subject_hand(subject, side, subdivisions)
+    loop = wrist_loop(subject, side, subdivisions).loop
+    rest = hand.rest_skin
+    rim = rest[loop].mean(axis=0)
+    bare = subject.looks.arm == "bare"
+    forward = unit(hand.joints[4] - hand.joints[0])
+    back = perpendicular(np.array([0.0, 1.0, 0.0]), forward)
+    frame = np.stack([np.cross(back, forward), back, forward], axis=1)
+    ahead = (_ON_ARM if bare else _BEFORE_SLEEVE)[item.kind]
+    skin = rest_arm(subject, side, subdivisions) if bare else rest
+    local = (skin - rim) @ frame
+    belt = np.abs(local[:, 2] - ahead) < 0.0045
+    middle = 0.5 * (local[belt, :2].max(axis=0) + local[belt, :2].min(axis=0))
+    outline = _outline(local[belt, :2] - middle)
+    place = rim + frame @ np.array([*middle, ahead])
+    color = srgb_to_linear(np.array(item.color))
+    if item.kind == "watch":
+        wide, high = 0.5 * np.ptp(local[belt, :2], axis=0) + 0.0008
+        made = wrist_watch((float(wide), float(high)), item.color)
+        # The watch lies around x with its dial to y.
+        frame = np.stack([frame[:, 2], frame[:, 1], np.cross(frame[:, 2], frame[:, 1])], axis=1)
+    elif item.kind == "bangle":
+        made = band(outline + 0.0012, 0.007, 0.0025, plain(color, gloss=0.22, specular=0.5))
+    else:
+        made = beads(outline + 0.0008, 0.0085, plain(color, gloss=0.3, specular=0.06))
+    if bare:
+        near = near_wrist(len(loop), -ahead)
+    else:
+        near = np.flatnonzero(np.abs(local[: len(hand.template.vertices), 2] - ahead) < 0.012)
+    return Mount(_placed(made, frame, place, hand=False), near, skin[near], on_arm=bare)
+
+
+def _outline(points: np.ndarray) -> np.ndarray:
+    """Radius of (N, 2) points at `angles()`: (AROUND,) m, smooth, at most 5 % inside any point."""
+    turn = np.arctan2(points[:, 1], points[:, 0])
+    radius = np.linalg.norm(points, axis=1)
+
+    def waves(at: np.ndarray) -> np.ndarray:
+        return np.stack(
+            [np.ones_like(at), *(f(k * at) for k in (1, 2) for f in (np.cos, np.sin))], axis=1
+        )
+
+    fitted = np.linalg.lstsq(waves(turn), radius, rcond=None)[0]
+    # A band lies on what stands out.
+    proud = float(np.quantile(radius - waves(turn) @ fitted, 0.9))
+    return waves(angles()) @ fitted + max(proud, 0.0)
+
+
+def _placed(thing: Surface, frame: np.ndarray, place: np.ndarray, *, hand: bool) -> Surface:
+    moved = transformed(thing, rigid(frame, place))
+    return replace(moved, hand=np.full(len(moved.faces), hand))

@@ -7,7 +7,7 @@ masks. Watch, bracelet, sleeve and forearm do not.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Annotated, Any, Literal
 
 from msgspec import Meta
@@ -15,7 +15,7 @@ from msgspec import Meta
 from hwp_bench.base.errors import ODD_CHARACTERS, UsageError
 from hwp_bench.base.records import Seed, number
 from hwp_bench.sim.geometry.surface import Color
-from hwp_bench.sim.hand.off_template import SubjectAnatomy
+from hwp_bench.sim.hand.anatomy import SubjectAnatomy
 from hwp_bench.sim.subject.wear import Glove, Polish, Ring, Tattoo, WristWear
 
 
@@ -60,29 +60,12 @@ class Looks:
                 raise UsageError("a hand wears two", field=name)
 
     def on(self, side: str) -> Looks:
-        """The looks of one hand: what the other one wears is left out.
-
-        Hands that look alike give equal looks, so that they share one painting.
-        """
-
-        def worn(items: tuple[Any, ...]) -> tuple[Any, ...]:
-            return tuple(
-                replace(item, side="both") for item in items if item.side in (side, "both")
-            )
-
-        return replace(
-            self,
-            tattoos=worn(self.tattoos),
-            polish=worn(self.polish),
-            rings=worn(self.rings),
-            wrist=worn(self.wrist),
-            gloves=worn(self.gloves),
-        )
-
-    def to_json(self) -> dict[str, Any]:
-        """Return what differs from the defaults, as JSON values."""
-        plain = asdict(PLAIN)
-        return {name: value for name, value in asdict(self).items() if value != plain[name]}
+        """The looks of one hand; hands that look alike give equal looks and share one painting."""
+        worn: dict[str, Any] = {}
+        for name in ("tattoos", "polish", "rings", "wrist", "gloves"):
+            items = [item for item in getattr(self, name) if item.side in (side, "both")]
+            worn[name] = tuple(replace(item, side="both") for item in items)
+        return replace(self, **worn)
 
     @property
     def passes(self) -> tuple[str, ...]:
@@ -129,3 +112,10 @@ class Subject:
     looks: Looks = PLAIN
     #: Geometry that no shape of the model has; None for the model as it is.
     anatomy: SubjectAnatomy | None = None
+
+
+def without_defaults(record: Any, keep: tuple[str, ...] = ()) -> dict[str, Any]:
+    """A record as JSON values, without fields that say what they say by default."""
+    said = [item for item in fields(record) if getattr(record, item.name) != item.default]
+    wanted = {*keep, *(item.name for item in said)}
+    return {name: value for name, value in asdict(record).items() if name in wanted}

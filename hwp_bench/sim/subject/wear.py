@@ -24,14 +24,18 @@ from hwp_bench.sim.geometry.surface import (
     Color,
     Material,
     Surface,
-    albedo,
+    around_z,
     canvas,
     coat,
     ease,
-    grid,
     ink,
     join,
+    perpendicular,
+    picture_material,
     plain,
+    rigid,
+    sheet,
+    shift,
     transformed,
     turned,
     unit,
@@ -61,8 +65,7 @@ def tattoo_cover(anatomy: Anatomy, tattoo: Tattoo) -> np.ndarray:
         first = FIRST_JOINT[finger] + (1 if finger == "thumb" else 0)
         start, end = anatomy.joints[first], anatomy.joints[first + 1]
         bone = unit(end - start)
-        axis = finger_back(finger)
-        axis = unit(axis - (axis @ bone) * bone)
+        axis = perpendicular(finger_back(finger), bone)
         offset = anatomy.points - 0.5 * (start + end)
         x, y = offset @ np.cross(axis, bone), offset @ bone
         owned = anatomy.weights[:, FIRST_JOINT[finger] : FIRST_JOINT[finger] + 3].sum(axis=1)
@@ -360,63 +363,38 @@ def angles() -> np.ndarray:
 
 
 def band(outline: np.ndarray, width: float, thickness: float, material: Material) -> Surface:
-    """A closed band with a rounded section.
-
-    Takes `outline` (AROUND,) m from the axis at each of `angles()`.
-    """
+    """A closed band with a rounded section, its `outline` m from the axis at `angles()`."""
     turn = np.linspace(0.0, 2.0 * np.pi, _SECTION)
     # A superellipse: flat outside, round at the edges.
     along = 0.5 * width * np.sign(np.cos(turn)) * np.abs(np.cos(turn)) ** 0.6
     out = 0.5 * thickness * (1.0 + np.sign(np.sin(turn)) * np.abs(np.sin(turn)) ** 0.6)
-    radius = outline[None] + out[:, None]
     around = angles()
-    vertices = np.stack(
-        [
-            radius * np.cos(around),
-            radius * np.sin(around),
-            np.broadcast_to(along[:, None], radius.shape),
-        ],
-        axis=-1,
-    ).reshape(-1, 3)
-    made = grid(vertices, _SECTION, AROUND, material)
+    vertices = around_z(outline[None] + out[:, None], along[:, None], around)
     center = np.stack([outline * np.cos(around), outline * np.sin(around), 0.0 * around], axis=1)
     away = vertices - np.tile(center + 0.5 * thickness * center / outline[:, None], (_SECTION, 1))
-    if np.einsum("ni,ni->n", made.normals, away).sum() < 0:
-        made = grid(vertices, _SECTION, AROUND, material, flip=True)
-    return made
+    return sheet(vertices, _SECTION, AROUND, material, away)
 
 
 def stone(diameter: float, color: tuple[float, float, float], setting: Material) -> Surface:
     """A cut stone in its setting, on the plane z = 0."""
     r = 0.5 * diameter
-    cup = turned(
-        np.array([[0.75 * r, -0.3 * r], [1.12 * r, 0.35 * r], [0.95 * r, 0.45 * r]]), setting
-    )
+    cup = [(0.75 * r, -0.3 * r), (1.12 * r, 0.35 * r), (0.95 * r, 0.45 * r)]
+    cut = [(1.0 * r, 0.3 * r), (0.98 * r, 0.5 * r), (0.6 * r, 0.85 * r), (1e-5, 0.86 * r)]
     gem = coat(color, gloss=0.08, specular=0.12)
-    cut = turned(
-        np.array([[1.0 * r, 0.3 * r], [0.98 * r, 0.5 * r], [0.6 * r, 0.85 * r], [1e-5, 0.86 * r]]),
-        gem,
-        around=8,
-    )
-    return join([cup, cut])
+    return join([turned(cup, setting), turned(cut, gem, around=8)])
 
 
 def beads(outline: np.ndarray, diameter: float, material: Material) -> Surface:
     """A string of beads along an outline as in `band`."""
     way = np.linspace(0.0, np.pi, 7)
-    ball = turned(
-        0.5 * diameter * np.stack([np.sin(way) + 1e-6, -np.cos(way)], axis=1), material, 10
-    )
+    profile = 0.5 * diameter * np.stack([np.sin(way) + 1e-6, -np.cos(way)], axis=1)
+    ball = turned(profile, material, 10)
     length = 2.0 * np.pi * float(np.mean(outline)) + np.pi * diameter
     count = int(length / (1.03 * diameter))
-    parts = []
-    for turn in np.linspace(0.0, 2.0 * np.pi, count, endpoint=False):
-        move = np.eye(4)
-        radius = np.interp(turn, angles(), outline) + 0.5 * diameter
-        move[:2, 3] = radius * np.cos(turn), radius * np.sin(turn)
-        parts.append(transformed(ball, move))
-    joined = join(parts)
-    return joined
+    turns = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
+    radius = np.interp(turns, angles(), outline) + 0.5 * diameter
+    places = np.stack([radius * np.cos(turns), radius * np.sin(turns), 0.0 * turns], axis=1)
+    return join([shift(ball, place) for place in places])
 
 
 #: A finger.
@@ -453,6 +431,8 @@ class WristWear:
     side: Wearing = "left"
 
 
+#: Rotation of what stands on z to y.
+UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 _STRAP = 0.011
 
 
@@ -461,42 +441,20 @@ def wrist_watch(wrist: tuple[float, float], color: tuple[float, float, float]) -
     leather = coat(color, gloss=0.55)
     steel = plain((0.6, 0.6, 0.62), gloss=0.18, specular=0.6)
     angles = np.linspace(0.0, 2.0 * np.pi, 41)
-    profile = ((-1.0, 0.0), (-1.0, 0.0028), (1.0, 0.0028), (1.0, 0.0))
-    rows = [
-        np.stack(
-            [
-                np.full_like(angles, side * _STRAP),
-                (wrist[1] + lift) * np.cos(angles),
-                (wrist[0] + lift) * np.sin(angles),
-            ],
-            axis=1,
-        )
-        for side, lift in profile
-    ]
-    strap = grid(np.concatenate(rows), len(rows), len(angles), leather)
-    outward = strap.vertices * np.array([0.0, 1.0, 1.0])
-    if np.einsum("ni,ni->n", strap.normals, outward).sum() < 0:
-        strap = grid(np.concatenate(rows), len(rows), len(angles), leather, flip=True)
-    case = turned(
-        np.array([[0.0, 0.0], [0.019, 0.0], [0.02, 0.003], [0.02, 0.007], [0.018, 0.009]]), steel
-    )
-    face = Material(albedo=albedo(_dial()), gloss=0.15)
-    dial = _flat_disc(0.0182, 0.0088, face)
-    return join([strap, *(transformed(part, _upright(wrist[1])) for part in (case, dial))])
-
-
-def _upright(top: float) -> np.ndarray:
-    """z to +y, on top of a wrist of that height, m."""
-    move = np.eye(4)
-    move[:3, :3] = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-    move[1, 3] = top + 0.001
-    return move
-
-
-def _flat_disc(radius: float, height: float, material: Material) -> Surface:
-    disc = turned(np.array([[radius, height - 1e-4], [1e-4, height]]), material)
-    uv = disc.vertices[disc.faces][..., :2] / (2.0 * radius) + 0.5
-    return replace(disc, corner_uv=uv, normals=np.tile([0.0, 0.0, 1.0], (len(disc.vertices), 1)))
+    rows = []
+    for side, lift in ((-1.0, 0.0), (-1.0, 0.0028), (1.0, 0.0028), (1.0, 0.0)):
+        y, z = (wrist[1] + lift) * np.cos(angles), (wrist[0] + lift) * np.sin(angles)
+        rows.append(np.stack([np.full_like(angles, side * _STRAP), y, z], axis=1))
+    vertices = np.concatenate(rows)
+    strap = sheet(vertices, len(rows), len(angles), leather, vertices * np.array([0.0, 1.0, 1.0]))
+    case = turned([(0.0, 0.0), (0.019, 0.0), (0.02, 0.003), (0.02, 0.007), (0.018, 0.009)], steel)
+    radius, height = 0.0182, 0.0088
+    dial = turned([(radius, height - 1e-4), (1e-4, height)], picture_material(_dial(), 0.15))
+    uv = dial.vertices[dial.faces][..., :2] / (2.0 * radius) + 0.5
+    flat = np.tile([0.0, 0.0, 1.0], (len(dial.vertices), 1))
+    on_top = rigid(UPRIGHT, (0.0, wrist[1] + 0.001, 0.0))
+    parts = (case, replace(dial, corner_uv=uv, normals=flat))
+    return join([strap, *(transformed(part, on_top) for part in parts)])
 
 
 def _dial() -> np.ndarray:

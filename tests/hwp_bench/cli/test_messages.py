@@ -73,12 +73,12 @@ def test_a_subject_is_painted_without_a_cache(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from hwp_bench.sim.scene_files import load_scene
-    from hwp_bench.sim.subject.atlas import SkinAtlas, kept
+    from hwp_bench.sim.subject.hand import kept, skin_material
 
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("HWP_CACHE", str(tmp_path / "file" / "cache"))
     subject = load_scene("capture0").subject
-    blank = SkinAtlas(*(np.zeros((2, 2, 3)), np.zeros((2, 2)), np.zeros((2, 2))))
+    blank = skin_material(*(np.zeros((2, 2, 3)), np.zeros((2, 2)), np.zeros((2, 2))))
     template = SimpleNamespace(digest="of a template")
     hand: Any = SimpleNamespace(template=template, model=template, betas=np.zeros(10))
     assert kept(hand, subject, "test", lambda: blank) is blank

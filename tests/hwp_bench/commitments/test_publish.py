@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from small_captures import CaptureMaker
-from small_methods import SUBMISSION, write_manifest
+from small_methods import write_submission
 
 from hwp_bench.base.errors import BadCapture, BadInput, UsageError
 from hwp_bench.base.files import canonical_json
@@ -147,12 +147,12 @@ def test_masks_are_committed_to(publication: Publication) -> None:
 def test_submissions_are_scored_against_the_sealed_part(
     captures: list[Capture], publication: Publication, tmp_path: Path, capsys
 ) -> None:
-    entry = tmp_path / "entry"
-    for capture in captures:
-        for frame in (18, 19):
-            pixels = capture.frame(frame) // 2
-            write_image(entry / "predictions" / capture.info.id / f"{frame:06d}.png", pixels)
-    write_manifest(entry, "half", SUBMISSION)
+    images = {
+        f"{capture.info.id}/{frame:06d}.png": capture.frame(frame) // 2
+        for capture in captures
+        for frame in (18, 19)
+    }
+    entry = write_submission(tmp_path / "entry", images, "half")
     words = ["evaluate", str(entry), "--json", "--out"]
     assert main([*words, str(tmp_path / "s"), "--sealed", str(publication.sealed)]) == 0
     shown = capsys.readouterr()

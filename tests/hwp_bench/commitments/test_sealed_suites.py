@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from small_methods import write_submission
 
 from hwp_bench.base.errors import BadInput, HwpError, UsageError
 from hwp_bench.base.images import read_rgb, write_image
@@ -21,8 +22,7 @@ from hwp_bench.commitments import suite as making
 from hwp_bench.commitments.publication import joint_commitment
 from hwp_bench.commitments.recipe import derived, read_secret, recipe_of, sealed_items
 from hwp_bench.methods.request import open_request
-from hwp_bench.sim.render import stage
-from hwp_bench.sim.subject import atlas
+from hwp_bench.sim.subject import hand as atlas
 
 RECIPE = recipe_of(["capture2"], 10, 40)
 NAME = "sealed-capture2"
@@ -35,10 +35,8 @@ def small_skin() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(atlas, "ATLAS", 256)
         atlas.skin_atlas.cache_clear()
-        stage._skin.cache_clear()
         yield
     atlas.skin_atlas.cache_clear()
-    stage._skin.cache_clear()
 
 
 @pytest.fixture(scope="module")
@@ -131,15 +129,9 @@ def test_a_stopped_start_goes_on_with_its_secret(
 def test_the_truth_scores_perfectly(suite: Path, tmp_path: Path) -> None:
     part = open_sealed(suite / "publication")
     capture = open_capture(part.captures[0])
-    entry = tmp_path / "truth"
-    for frame in part.splits[NAME].test.tolist():
-        place = entry / "predictions" / NAME / frame_name(frame)
-        place.parent.mkdir(parents=True, exist_ok=True)
-        write_image(place, capture.frame(frame))
-    (entry / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "truth"\ntitle = "Truth"\ndescription = ""\n\n'
-        '[entry]\npredictions = "predictions"\n'
-    )
+    frames = part.splits[NAME].test.tolist()
+    images = {f"{NAME}/{frame_name(frame)}": capture.frame(frame) for frame in frames}
+    entry = write_submission(tmp_path / "truth", images, "truth")
     out = tmp_path / "run"
     sealed = str(suite / "publication" / "sealed")
     assert main(["evaluate", str(entry), "--sealed", sealed, "-o", str(out)]) == 0

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from small_captures import CaptureMaker
-from small_methods import SUBMISSION, write_manifest
+from small_methods import write_submission
 
 from hwp_bench.base.errors import BadCapture, BadImage, BadSplit, UsageError
 from hwp_bench.base.images import write_image
@@ -27,12 +27,14 @@ SETTINGS = EvaluationSettings(confinement=Confinement("none"))
 
 def submission(folder: Path, captures: list[Capture], pixels=Capture.frame) -> Path:
     """An entry that is nothing but predictions; `pixels(capture, frame)` makes them."""
-    for capture in captures:
-        target = folder / "predictions" / capture.info.id
-        for frame in contiguous_split(capture.info.id, len(capture)).test.tolist():
-            write_image(target / f"{frame:06d}.png", pixels(capture, frame))
-    write_manifest(folder, "entry", SUBMISSION)
-    return folder
+    return write_submission(
+        folder,
+        {
+            f"{capture.info.id}/{frame:06d}.png": pixels(capture, frame)
+            for capture in captures
+            for frame in contiguous_split(capture.info.id, len(capture)).test.tolist()
+        },
+    )
 
 
 def run(entry: Path, captures: list[Capture], out: Path) -> Results:

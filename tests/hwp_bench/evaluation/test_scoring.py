@@ -19,10 +19,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from small_captures import CaptureMaker, hand_picture
-from small_methods import SUBMISSION, write_manifest
+from small_methods import write_submission
 
 from hwp_bench.base.files import sha256_json
-from hwp_bench.base.images import as_uint8, write_image
+from hwp_bench.base.images import as_uint8
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.check import check_capture
 from hwp_bench.cli.main import main
@@ -89,10 +89,11 @@ def test_evaluate_warns_and_leaves_the_score_alone(
 ) -> None:
     capture = make_capture(frames=20, size=48)
     entry, out = tmp_path / "entry", tmp_path / "out"
-    for frame in (18, 19):
-        pixels = np.ascontiguousarray(capture.frame(frame)[:, :, ::-1])
-        write_image(entry / "predictions" / "tiny" / f"{frame:06d}.png", pixels)
-    write_manifest(entry, "bgr", SUBMISSION)
+    images = {
+        f"tiny/{frame:06d}.png": np.ascontiguousarray(capture.frame(frame)[:, :, ::-1])
+        for frame in (18, 19)
+    }
+    write_submission(entry, images, "bgr")
     words = ["evaluate", str(entry), "--capture", str(capture.root), "--out", str(out)]
     assert main(words) == 0
     captured = capsys.readouterr()
@@ -112,18 +113,11 @@ def stripped(whole: Capture, tmp_path: Path) -> Capture:
     return open_capture(folder)
 
 
-def submission(folder: Path, name: str, capture: Capture) -> Path:
-    for frame in (18, 19):
-        pixels = capture.frame(frame) // 2
-        write_image(folder / "predictions" / "clip" / f"{frame:06d}.png", pixels)
-    write_manifest(folder, name, SUBMISSION)
-    return folder
-
-
 @pytest.fixture
 def both(whole: Capture, stripped: Capture, tmp_path: Path) -> list[Results]:
     for name, capture in (("one", whole), ("two", stripped)):
-        folder = submission(tmp_path / name, name, whole)
+        images = {f"clip/{frame:06d}.png": whole.frame(frame) // 2 for frame in (18, 19)}
+        folder = write_submission(tmp_path / name, images, name)
         words = ["evaluate", str(folder), "-o", str(tmp_path / f"out-{name}")]
         assert main([*words, "--capture", str(capture.root)]) == 0
     return [read_results(tmp_path / f"out-{name}") for name in ("one", "two")]

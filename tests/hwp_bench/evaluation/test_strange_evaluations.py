@@ -51,11 +51,8 @@ def claiming(folder: Path, facts: str, more: str = "") -> Path:
     [
         ('{"fit_seconds": 5e-324, "render_seconds": 5e-324}', 0),
         ('{"fit_seconds": 1.7e308, "render_seconds": 1.7e308}', 1),
-        ('{"fit_seconds": -1.0}', 1),
         ('{"steps": 18446744073709551616}', 1),
         ('{"device": "\\ud800"}', 1),
-        ('{"device": "two\\nlines"}', 1),
-        ('{"peak_memory": 9223372036854775807}', 1),
     ],
 )
 def test_whatever_a_method_claims_ends_in_tables(

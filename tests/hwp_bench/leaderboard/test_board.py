@@ -13,7 +13,7 @@ from made_entries import check_of, complete_results, page_of
 
 from hwp_bench.capture.splits import split_for
 from hwp_bench.cli.main import main
-from hwp_bench.leaderboard import board as severity_scopes
+from hwp_bench.leaderboard import suite_data
 from hwp_bench.leaderboard.board import (
     BoardRow,
     at_severity,
@@ -22,14 +22,13 @@ from hwp_bench.leaderboard.board import (
     method_rows,
     reference_lead,
     severities_of,
-    suite_severities,
 )
 from hwp_bench.leaderboard.entries import Submission, make_entry, write_check, write_entry
 from hwp_bench.leaderboard.site import build_site
+from hwp_bench.leaderboard.suite_data import suite_severities
 from hwp_bench.report.sources import mean_severity
 from hwp_bench.results.schema import score_rows
-from hwp_bench.sim.produce.capture import render_capture
-from hwp_bench.sim.produce.suites import SuiteItem
+from hwp_bench.sim.produce.capture import SuiteItem, render_capture
 from hwp_bench.sim.scene_files import load_scene
 
 
@@ -312,7 +311,7 @@ def test_scenes_say_what_captures_say(tmp_path, monkeypatch) -> None:
     """Oracle: the severities that a rendered capture holds."""
     scene = load_scene("capture0")
     item = SuiteItem(scene, 20, 32)
-    monkeypatch.setattr(severity_scopes, "suite", lambda name: (item,))
+    monkeypatch.setattr(suite_data, "suite", lambda name: (item,))
     capture = render_capture(
         scene, tmp_path / "c", frame_count=20, size=32, workers=1, free_view=False
     )

@@ -20,12 +20,11 @@ from hwp_bench.base.files import sha256_json
 from hwp_bench.base.images import write_image
 from hwp_bench.capture import Capture
 from hwp_bench.capture.schema import frame_name
-from hwp_bench.leaderboard.board import BoardRow, board_rows, budget_text, curve_plot
+from hwp_bench.leaderboard.board import BoardRow, board_rows, budget_text
 from hwp_bench.leaderboard.entries import Entry, Submission, entry_name, make_entry
 from hwp_bench.leaderboard.site import (
-    FRAMES,
-    _spread,
     build_site,
+    curve_plot,
     method_pages,
     script,
     write_method_pages,
@@ -376,15 +375,6 @@ def test_without_predictions_there_is_no_viewer(
     assert 'id="viewer"' in built.read_text("utf-8")
 
 
-@pytest.mark.parametrize("count", [1, 2, FRAMES, FRAMES + 1, 50])
-def test_frames_are_spread_over_the_clip(count: int) -> None:
-    found = _spread(list(range(count)))
-    assert len(found) == min(count, FRAMES) == len(set(found))
-    assert (found[0], found[-1]) == (0, count - 1)
-    steps = np.diff(found)
-    assert len(steps) == 0 or steps.max() - steps.min() <= 1
-
-
 @pytest.fixture
 def driver(built: Path, tmp_path: Path) -> Iterator[Any]:
     with open_page(built, tmp_path / "profile") as found:
@@ -566,9 +556,9 @@ def test_the_plot_of_a_table_names_every_method_and_the_front(count: int) -> Non
 
     plot = curve_plot(board_rows([run(number) for number in range(count)]))
     assert plot is not None
-    assert len(plot.methods) == count
-    assert list(plot.front) == [f"M{count - 1}"]
-    assert plot.figure.count('class="band"') == (count if count <= 4 else 1)
+    assert len(plot["methods"]) == count
+    assert list(plot["front"]) == [f"M{count - 1}"]
+    assert plot["figure"].count('class="band"') == (count if count <= 4 else 1)
 
 
 def test_without_curves_there_is_no_plot() -> None:

@@ -22,7 +22,7 @@ from hwp_bench.evaluation.scoring import predictions_digest, read_predictions
 from hwp_bench.leaderboard.entries import digest, make_entry, read_entries, write_entry
 from hwp_bench.leaderboard.submit import confirm, entry_of
 from hwp_bench.results import read_results, write_results
-from hwp_bench.sim.produce.suites import suite
+from hwp_bench.sim.produce.capture import suite
 
 
 @pytest.fixture

@@ -12,9 +12,9 @@ from hwp_bench.base.errors import BadInput, BadMethod
 from hwp_bench.methods.contents import (
     digest_of,
     exposed_digest,
-    left_out_folders,
     method_files,
     refuse_links_out,
+    unseen_folders,
 )
 
 
@@ -63,8 +63,18 @@ def test_what_a_method_cannot_see_does_not_count(tmp_path: Path) -> None:
         (root / name).write_text(f'{{"schema": "hwp-{schema}/1"}}')
     os.mkfifo(root / "pipe")
     assert method_digest(root) == first
-    found = [path.relative_to(root).as_posix() for path in left_out_folders(root)]
-    assert found == [".git", ".mypy_cache", "src/__pycache__"]
+
+    def unseen(**named: bool) -> list[str]:
+        return [path.relative_to(root).as_posix() for path in unseen_folders(root, **named)]
+
+    foreign = ["clip", "old", "runs/mine"]
+    assert unseen() == [".git", ".mypy_cache", *foreign, "src/__pycache__"]
+    assert unseen(ships=True) == foreign
+    # What is compiled in an environment of Python stays, and a run in it does not.
+    (root / "src" / "pyvenv.cfg").touch()
+    (root / "src" / "run").mkdir()
+    (root / "src" / "run" / ".lock").touch()
+    assert unseen() == [".git", ".mypy_cache", *foreign, "src/run"]
 
 
 def test_a_link_inside_counts_by_where_it_leads(tmp_path: Path) -> None:

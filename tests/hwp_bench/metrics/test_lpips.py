@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hwp_bench.base.errors import BadInput, MissingDependency, ShapeMismatch
+from hwp_bench.base.errors import BadInput, MissingDependency
 from hwp_bench.metrics import lpips as lpips_weights
 from hwp_bench.metrics.lpips import (
     BACKBONE_FILES,
@@ -124,63 +124,9 @@ def test_matches_torchmetrics(net, images, monkeypatch):
     assert Lpips(net, backbone, linear)(*images) == pytest.approx(expected, rel=1e-5)
 
 
-def test_identical_images_score_zero_and_batches_equal_single_images(images):
+def test_identical_images_score_zero(images):
     _, backbone, linear = random_network("alex")
-    lpips = Lpips("alex", backbone, linear)
-    x, y = images
-    assert lpips(x, x) == 0.0
-    batch = torch.from_numpy(np.stack([x, y])).permute(0, 3, 1, 2).float() * 2 - 1
-    together = lpips.distance(batch, batch.flip(0))
-    assert together.tolist() == pytest.approx([lpips(x, y), lpips(y, x)], rel=1e-5)
-
-
-def test_gradients_reach_the_image(images):
-    _, backbone, linear = random_network("alex")
-    x, y = (torch.from_numpy(i.transpose(2, 0, 1)[None]).float() * 2 - 1 for i in images)
-    x.requires_grad_()
-    Lpips("alex", backbone, linear).distance(x, y).sum().backward()
-    assert torch.isfinite(x.grad).all()
-    assert x.grad.abs().max() > 0
-
-
-def broken(state: dict, name: str, value) -> dict:
-    changed = dict(state)
-    if value is None:
-        del changed[name]
-    else:
-        changed[name] = value
-    return changed
-
-
-@pytest.mark.parametrize(
-    ("part", "name", "value", "message"),
-    [
-        ("backbone", "features.3.weight", None, "features.3.weight: the checkpoint lacks"),
-        ("backbone", "features.3.weight", "text", "features.3.weight: the checkpoint lacks"),
-        ("backbone", "features.0.bias", (63,), r"features.0.bias: has shape \(63,\), not \(64,\)"),
-        ("linear", "lin2.model.1.weight", (1, 1, 1, 1), r"lin2.*not \(1, 384, 1, 1\)"),
-        ("linear", "lin0.model.1.weight", "nan", "NaN"),
-    ],
-)
-def test_a_wrong_checkpoint_is_refused_by_the_name_of_the_weight(part, name, value, message):
-    _, backbone, linear = random_network("alex")
-    if isinstance(value, tuple):
-        value = torch.zeros(value)
-    elif value == "nan":
-        value = torch.full((1, 64, 1, 1), float("nan"))
-    states = {"backbone": backbone, "linear": linear}
-    states[part] = broken(states[part], name, value)
-    with pytest.raises(BadInput, match=message):
-        Lpips("alex", states["backbone"], states["linear"])
-
-
-def test_images_that_do_not_fit_are_refused(images):
-    _, backbone, linear = random_network("alex")
-    lpips = Lpips("alex", backbone, linear)
-    with pytest.raises(ShapeMismatch):
-        lpips(images[0], images[1][1:])
-    with pytest.raises(ShapeMismatch, match="too small"):
-        lpips(images[0][:31], images[1][:31])
+    assert Lpips("alex", backbone, linear)(images[0], images[0]) == 0.0
 
 
 @pytest.fixture
@@ -193,26 +139,10 @@ def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def small_states() -> tuple[dict, dict]:
-    """States with the shapes of AlexNet."""
-    from hwp_bench.metrics.lpips import BACKBONES
-
-    backbone, channels = {}, []
-    for layer in BACKBONES["alex"]:
-        fan_in, fan_out = layer.channels
-        shape = (fan_out, fan_in, layer.kernel, layer.kernel)
-        backbone[f"features.{layer.index}.weight"] = 0.01 * torch.ones(shape)
-        backbone[f"features.{layer.index}.bias"] = torch.zeros(fan_out)
-        channels.append(fan_out)
-    return backbone, {
-        f"lin{k}.model.1.weight": torch.ones(1, c, 1, 1) for k, c in enumerate(channels)
-    }
-
-
 @pytest.fixture
 def installed(hub: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]:
     """Made-up weights, backbone and linear layers, that are declared to be the published ones."""
-    backbone, linear = small_states()
+    _, backbone, linear = random_network("alex")
     draft, package = hub / "draft", hub.parent / "layers"
     (package / "v").mkdir(parents=True)
     (package / "__init__.py").touch()

@@ -50,9 +50,11 @@ def test_matches_openimageio(pair):
     mask = mask & (np.indices(mask.shape).sum(axis=0) > 70)
     found = scores(prediction, target, mask)
     expected = oiio_psnr(prediction[mask][:, None] / 255.0, target[mask][:, None] / 255.0)
-    assert found["psnr"] == found["psnr_edge"] == pytest.approx(expected, abs=1e-5)
+    for name in ("psnr", "psnr_edge"):
+        assert found[name] == pytest.approx(expected, abs=1e-5)
     x, y = (image / 255.0 * mask[..., None] for image in (prediction, target))
-    assert found["psnr_full"] == found["paper_psnr"] == pytest.approx(oiio_psnr(x, y), abs=1e-5)
+    for name in ("psnr_full", "paper_psnr"):
+        assert found[name] == pytest.approx(oiio_psnr(x, y), abs=1e-5)
     rows, columns = np.nonzero(mask)
     window = slice(rows.min() + 5, rows.max() + 16), slice(columns.min() + 5, columns.max() + 16)
     x, y = (np.pad(image, ((10, 10), (10, 10), (0, 0)))[window].copy() for image in (x, y))
@@ -165,8 +167,6 @@ def test_identical_images_score_exactly_one_and_none_leaves_the_range(seed, heig
 
 def test_ssim_refuses_what_does_not_fit(ssim_pair):
     x, y, mask = ssim_pair
-    with pytest.raises(ShapeMismatch):
-        ssim_box(x, y[1:], mask)
     with pytest.raises(ShapeMismatch, match="smaller than the window"):
         ssim_map(x[:10], y[:10], HWP_V1.ssim)
     with pytest.raises(EmptyMask):

@@ -23,13 +23,12 @@ from hwp_bench.base.tables import Column, Table
 from hwp_bench.leaderboard.entries import make_entry
 from hwp_bench.leaderboard.site import build_site
 from hwp_bench.report.page import (
-    MAX_PAGE_BYTES,
-    Album,
     gather_report,
     summary_sentence,
     template_environment,
     write_report,
 )
+from hwp_bench.report.pictures import MAX_PAGE_BYTES, Album
 from hwp_bench.report.sources import ResultsSource
 from hwp_bench.results import CurvePoint
 

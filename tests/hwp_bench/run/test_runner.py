@@ -110,7 +110,6 @@ for frame in range(*split["test"]):
 @pytest.mark.parametrize(
     ("body", "problem"),
     [
-        ("raise ValueError('no luck')", "ValueError: no luck"),
         ("import os; os._exit(3)", "exit status 3"),
         ("import os; os.kill(os.getpid(), 9)", "killed by SIGKILL"),
         ("return None", "AttributeError"),
@@ -121,7 +120,6 @@ for frame in range(*split["test"]):
         ("raise type('Own', (BaseException,), {})('a reason')", "Own: a reason"),
         ("raise ValueError('a reason \\ud800')", r"ValueError: a reason \?"),
         ("Avatar.render = lambda *a: np.zeros((32, 32, 3), complex)", "complex128, not real"),
-        ("Avatar.render = lambda *a: np.zeros((32, 32, 3), object)", "object, not real"),
     ],
 )
 def test_crashes_are_named(request_folder: Path, tmp_path: Path, body: str, problem: str) -> None:

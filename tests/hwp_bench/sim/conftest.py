@@ -7,11 +7,10 @@ from collections.abc import Callable, Iterator
 import pytest
 from tiny_scene import SINGLE
 
-from hwp_bench.sim.render import stage as person
 from hwp_bench.sim.scene.scene import Scene
 from hwp_bench.sim.scene_files import parse_scene
 from hwp_bench.sim.subject import arms as forearm
-from hwp_bench.sim.subject import atlas
+from hwp_bench.sim.subject import hand as atlas
 
 
 @pytest.fixture
@@ -35,7 +34,7 @@ def small_paintings(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     At 64 px a sixteenth of the texels is still finer than a pixel. Renders in other processes
     do not see it.
     """
-    kept = (atlas.skin_atlas, forearm.arm_atlas, person._skin, person._arm_skin)
+    kept = (atlas.skin_atlas, forearm.arm_atlas)
     monkeypatch.setattr(atlas, "ATLAS", 256)
     monkeypatch.setattr(forearm, "_ARM_TEXELS", (64, 64))
     for function in kept:

@@ -2,7 +2,9 @@
 
 Oracles: a sphere, whose depth is its radius less the distance from its centre; for gestures and
 scenes what was measured of these frames, rounded up (`python -m benchmarks.simulation
---penetration 40` prints it of more).
+--penetration 40` prints it of more); for two hands the signed distance to the nearest vertex of
+the other one along its normal: hands are about 25 mm thick, soft, and may press 12 mm into each
+other.
 """
 
 from __future__ import annotations
@@ -10,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial import cKDTree
 
 from benchmarks.penetration import (
     Segments,
@@ -20,8 +23,10 @@ from benchmarks.penetration import (
     self_penetration,
 )
 from hwp_bench.hands.poses import gestures
-from hwp_bench.sim.scene.motion import moment_of_key, scene_hands
-from hwp_bench.sim.scene.scene import HandKey
+from hwp_bench.sim.effects import hands_at
+from hwp_bench.sim.geometry.surface import RenderCost
+from hwp_bench.sim.render.stage import Stage
+from hwp_bench.sim.scene.scene import HandKey, moment_of_key, scene_hands
 from hwp_bench.sim.scene_files import load_scene, scene_names
 from hwp_bench.sim.subject.hand import MOVING, SubjectHand
 
@@ -100,3 +105,32 @@ def test_frames_of_scenes_are_bounded(name: str) -> None:
     moments = (np.arange(FRAMES) + 0.5) / FRAMES
     for part, depths in scene_penetration(load_scene(name), moments).items():
         assert depths.max() < (MUTUAL_DEEPEST if part == "both" else SELF_DEEPEST)
+
+
+INTERACTING = [name for name in scene_names() if load_scene(name).hands == "both"]
+#: Deepest that one hand may press into the other, m.
+TOUCH_DEEPEST = 0.012
+
+
+def _distances(name: str, moment: float) -> tuple[float, float]:
+    """How deep the left hand is inside the right one, and how near it is, m."""
+    scene = load_scene(name)
+    hands = scene_hands(scene, MOVING)
+    parameters = Stage(scene, RenderCost()).parameters(hands_at(scene, moment * scene.duration))
+    right, normals = hands["right"].pose(*parameters["right"])
+    left, _ = hands["left"].pose(*parameters["left"])
+    # Farther away than 30 mm the nearest normal tells nothing; there the distance is infinite.
+    distance, nearest = cKDTree(right).query(left, distance_upper_bound=0.03)
+    near = np.flatnonzero(np.isfinite(distance))
+    away = left[near] - right[nearest[near]]
+    inside = near[np.einsum("ni,ni->n", away, normals[nearest[near]]) < 0]
+    return float(distance[inside].max(initial=0.0)), float(distance.min())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", INTERACTING)
+def test_hands_do_not_run_through_each_other(name: str) -> None:
+    rows = [_distances(name, frame / 60) for frame in range(0, 60, 2)]
+    depth, gap = np.array(rows).T
+    assert depth.max() < TOUCH_DEEPEST
+    assert gap.min() < 0.004  # and they touch at times

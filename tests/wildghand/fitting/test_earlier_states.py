@@ -173,7 +173,9 @@ def test_the_error_is_that_of_the_validation_frames(training: TrainingCapture) -
     assert part(fit, StateChoice).error() == expected > 0.0
 
 
-@pytest.mark.parametrize("changes", [{"schedule.validated": False}, {"mode": "paper"}])
+@pytest.mark.parametrize(
+    "changes", [{"schedule.validated": False}, {"mode": "paper", "schedule.epochs": 0}]
+)
 def test_without_the_choice_a_fit_ends_with_its_last_state(
     changes: dict[str, Any], training: TrainingCapture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -124,6 +124,7 @@ def with_every_network(folder: Path, regions: str, hand: str) -> dict[str, Any]:
     return {
         **FIT,
         "mode": "paper",
+        "schedule.epochs": 0,
         "pao.regions": f"sam:{folder / regions}",
         "pao.hand": f"sam:{folder / hand}",
         "perceptual": f"vgg19:{folder / 'vgg19.pth'}",
@@ -179,7 +180,7 @@ def test_an_evaluation_in_the_sandbox_sees_the_files(
 def test_an_ablation_takes_the_networks_too(
     folder: Path, make_painted: Callable[..., Capture], tmp_path: Path, capsys: Any
 ) -> None:
-    settings = {**FIT, "mode": "paper", "pao.hand": f"sam:{folder / 'sam.pth'}"}
+    settings = {**FIT, "pao.hand": f"sam:{folder / 'sam.pth'}"}
     command = ["ablate", "--binary-mask", "--seeds", "1", "-o", str(tmp_path / "runs")]
     command += ["--capture", str(make_painted().root), *options(settings)]
     assert hwp_bench(command) == 0, capsys.readouterr().err

@@ -67,16 +67,6 @@ def test_it_is_its_definition(flatness: float) -> None:
     assert float(found) == pytest.approx(expected(raw, flatness), rel=1e-5)
 
 
-@FLATNESS
-def test_its_gradient(flatness: float) -> None:
-    raw = random_raw(2).requires_grad_()
-
-    def cost(channels: torch.Tensor) -> torch.Tensor:
-        return off_surface(RawAttributes.split(channels), Activation(), SPACING, flatness=flatness)
-
-    assert torch.autograd.gradcheck(cost, (raw,))
-
-
 def hard_raw() -> torch.Tensor:
     """Gaussians on both sides of every bound, and of no length or thickness."""
     raw = random_raw(3000)

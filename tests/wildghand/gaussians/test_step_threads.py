@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 from stopped_clock import stop_clock
-from tiny_fits import TINY
+from tiny_fits import UNJUDGED
 
 from hwp_bench.methods.contract import Budget
 from wildghand.fitting.components import make_fit
@@ -106,7 +106,7 @@ def test_a_fit_has_the_same_bits_whatever_was_chosen(
 ) -> None:
     """Every step on another number of threads, three among them, against one thread."""
     monkeypatch.setattr(threads, "WORTH_A_THREAD", 1)
-    settings = read_settings({**TINY, "schedule.batch": 2})
+    settings = read_settings({**UNJUDGED, "schedule.batch": 2})
     before, used = torch.get_num_threads(), set()
 
     class Changing(StepThreads):

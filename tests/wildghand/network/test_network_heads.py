@@ -1,8 +1,7 @@
-"""Oracle: finite differences in float64; and the heads' bounds and starts by hand."""
+"""The heads' bounds and starts, by hand."""
 
 from __future__ import annotations
 
-import pytest
 import torch
 
 from wildghand.gaussians.attributes import CHANNELS
@@ -34,38 +33,6 @@ def inputs(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
 
 def start() -> torch.Tensor:
     return torch.linspace(-1, 1, COUNT * CHANNELS).reshape(COUNT, -1).double()
-
-
-@pytest.mark.parametrize("direct", [True, False])
-def test_gradients_of_the_attribute_head(direct: bool) -> None:
-    settings = network_settings("compact", head_width=4, identity_channels=15, direct=direct)
-    head = stirred(AttributeHead(settings, TEXTURE, GEOMETRY))
-
-    def predict(x_t: torch.Tensor, x_g: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:
-        return head(head.texture(x_t), x_g, x_t[:, :15], start()).concatenate()
-
-    assert torch.autograd.gradcheck(predict, (*inputs(), *head.parameters()))
-
-
-def test_gradients_of_the_shadow_head() -> None:
-    head = stirred(ShadowHead(SETTINGS, GEOMETRY))
-    assert torch.autograd.gradcheck(lambda x, *_: head(x), (inputs()[1], *head.parameters()))
-
-
-def test_gradients_of_the_template_head() -> None:
-    head = stirred(TemplateHead(SETTINGS, TEXTURE))
-    position = torch.rand(COUNT, POSITION_CHANNELS, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(
-        lambda x, p, *_: head(x, p), (inputs()[0], position, *head.parameters())
-    )
-
-
-def test_gradients_of_the_refinement_head() -> None:
-    head = stirred(RefinementHead(SETTINGS, TEXTURE, GEOMETRY))
-    hand, frame = (features.detach().mean(dim=-2).requires_grad_() for features in inputs())
-    assert torch.autograd.gradcheck(
-        lambda t, g, *_: (*head(t, g), head.shape_change(t)), (hand, frame, *head.parameters())
-    )
 
 
 def test_every_head_starts_without_effect() -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from tiny_fits import UNJUDGED
 
 from hwp_bench.base.numerics import flushed, flushes
 from hwp_bench.methods.contract import Budget
@@ -88,7 +89,7 @@ def test_a_fit_flushes_and_gives_the_switch_back(make_training: Callable[..., An
         def progress(self, done: int, total: int) -> None:
             pass
 
-    method = WildGHandMethod({"gaussians": 600, "device": "cpu"}, 0)
+    method = WildGHandMethod(UNJUDGED, 0)
     avatar = method.fit(training, Budget(steps=2), Asked())
     assert found == [True] * 6
     assert not flushes()

@@ -5,6 +5,7 @@ Oracles: the machine code itself, numpy in float64, the same call without a cach
 
 from __future__ import annotations
 
+import functools
 import logging
 import platform
 import re
@@ -24,6 +25,7 @@ from wildghand.splat.kernels.project import project_backward
 X86 = platform.machine().lower() in ("x86_64", "amd64")
 
 
+@functools.cache
 def recompiled(kernel: Any) -> tuple[Any, Any]:
     """A kernel's first version, unrolled as RGB uses it, compiled anew; and its signature."""
     numba_backend.warm_up()

@@ -40,8 +40,8 @@ from wildghand.splat.kernels.vectors import (
     Vector,
     absolute,
     add_exponent,
+    add_lines,
     bits,
-    call,
     fma,
     lowered,
     make_constant,
@@ -335,17 +335,6 @@ def _zero_tuple(code: Call, channels: Any) -> ir.Value:
     return code.pack([PIXELS.constant(0.0)] * channels.type.count)
 
 
-@lowered(lambda state, at, weight, sums: sums)
-def _gather_tuple(code: Call, state: Any, at: Any, weight: Any, sums: Any) -> ir.Value:
-    """sums[k] + weight * (vector k of state)."""
-    values = []
-    for k, total in enumerate(code.unpack(sums)):
-        place = code.builder.add(at, ir.Constant(at.type, k * PIXELS.lanes))
-        upstream = code.load(state, place, PIXELS.llvm)
-        values.append(call(code.builder, "fma", PIXELS, [weight, upstream, total]))
-    return code.pack(values)
-
-
 def start_sums(sums, channels):
     """Sums of a splat's colour gradient, at zero; `sums` is scratch for the loop."""
 
@@ -370,7 +359,7 @@ def add_to_sums(sums, weight, state, at):
 @overload(add_to_sums)
 def _add_to_sums(sums, weight, state, at):
     if _fixed(sums):
-        return lambda sums, weight, state, at: _gather_tuple(state, at, weight, sums)
+        return lambda sums, weight, state, at: add_lines(state, at, LANES, weight, sums)
 
     def loop(sums, weight, state, at):
         for k in range(sums.size // LANES):

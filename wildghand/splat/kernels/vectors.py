@@ -272,6 +272,27 @@ def fma(code: Call, a: Any, b: Any, c: Any) -> ir.Value:
     return call(code.builder, "fma", vector, widen(code.builder, vector, (a, b, c), code.sig.args))
 
 
+@lowered(lambda array, index, stride, weight, sums: sums)
+def add_lines(code: Call, array: Any, index: Any, stride: Any, weight: Any, sums: Any) -> ir.Value:
+    """`sums`, to each of which weight times a vector is added; the vectors are `stride` apart."""
+    vector, made = code.sig.return_type.dtype, []
+    (weight,) = widen(code.builder, vector, [weight], code.sig.args[3:4])
+    for total in code.unpack(sums):
+        made.append(
+            call(code.builder, "fma", vector, [weight, code.load(array, index, vector.llvm), total])
+        )
+        index = code.builder.add(index, stride)
+    return code.pack(made)
+
+
+@lowered(_nothing)
+def store_lines(code: Call, array: Any, index: Any, stride: Any, values: Any) -> None:
+    """Writes the vectors of a tuple, `stride` apart."""
+    for value in code.unpack(values):
+        code.store(array, index, value)
+        index = code.builder.add(index, stride)
+
+
 def _make_unary(name: str) -> Any:
     """An intrinsic that applies an LLVM intrinsic of one argument in every lane."""
 

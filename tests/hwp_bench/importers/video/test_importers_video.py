@@ -38,6 +38,7 @@ QUICK = FitSettings(
 )
 #: The same without texture and pictures, where the fit is not what is asked about.
 QUICKER = replace(QUICK, texture=False, picture_rounds=0)
+HASTY = replace(QUICKER, landmark_steps=40, contour_steps=5)
 REAL = Path(__file__).resolve().parents[5] / "shared" / "data" / "real_hand"
 
 
@@ -186,6 +187,7 @@ def test_the_command_prints_the_numbers_and_saves_the_sheet(
     assert read_rgb(sheet).shape[0] > 96
     assert main([*words, "--min-score", "0.4"]) == 2
     assert "exists already" in capsys.readouterr().err
+    monkeypatch.setattr(FitSettings, "__init__", lambda self: _set(self, HASTY))
     assert main([*words, "--force", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["frames"] == 5
 
@@ -195,7 +197,9 @@ def _set(settings: FitSettings, values: FitSettings) -> None:
 
 
 def test_own_masks_are_taken(folder: Path, clip: SyntheticClip) -> None:
-    options = VideoImport(size=96, fit=QUICKER, focal=FOCAL, masks=folder / "masks")
+    options = VideoImport(
+        size=96, fit=QUICKER, focal=FOCAL, masks=folder / "masks", frames=FrameRange(0, 9)
+    )
     result = import_video(folder / "hand.avi", folder / "hand.npz", folder / "own", options)
     capture = open_capture(folder / "own")
     assert capture.info.source["masks"] == "user"

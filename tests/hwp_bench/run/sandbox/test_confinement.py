@@ -16,11 +16,11 @@ from walled_script import run_walled
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.kernels import KEPT
 from hwp_bench.base.packages import PACKAGES, data_folder
-from hwp_bench.run.sandbox import confinement as secluded
+from hwp_bench.methods import contents
+from hwp_bench.methods.contents import unseen_folders
 from hwp_bench.run.sandbox.confinement import (
     VISIBLE_PACKAGES,
     Confinement,
-    foreign_folders,
     hidden_packages,
     package_paths,
     sandbox_environment,
@@ -150,7 +150,7 @@ names = [name for name in NAMES if imports(name)]
 print(json.dumps({"found": found, "imports": names}))
 """
     hidden = [
-        "hwp_bench.sim.produce.suites",
+        "hwp_bench.sim.produce.capture",
         "hwp_bench.sim.produce.capture",
         "hwp_bench.sim.scene.scene",
         "hwp_bench.evaluation.evaluate",
@@ -251,14 +251,14 @@ def test_runs_and_captures_below_a_method_are_not_the_methods(tmp_path: Path) ->
     foreign = _litter(tmp_path)
     (tmp_path / "weights").mkdir()
     (tmp_path / "weights" / "results.json").write_text('{"accuracy": 0.5}')
-    assert sorted(foreign_folders(tmp_path)) == sorted(map(str, foreign))
+    assert unseen_folders(tmp_path) == sorted(foreign)
 
 
 def test_too_many_folders_are_one_message(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(secluded, "MAX_FOLDERS", 3)
+    monkeypatch.setattr(contents, "MAX_FOLDERS", 3)
     _litter(tmp_path)
     with pytest.raises(UsageError, match="holds more than 3 folders"):
-        foreign_folders(tmp_path)
+        unseen_folders(tmp_path)
 
 
 def test_a_method_does_not_see_earlier_runs_below_it(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from hwp_bench.base.rays import EmbreeMesh, EmbreexMesh, library, places_on_faces
-from hwp_bench.sim.geometry.rays import Tracer
+from hwp_bench.sim.geometry.surface import Tracer
 from hwp_bench.sim.light.shading import openness
 
 

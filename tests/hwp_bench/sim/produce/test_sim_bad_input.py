@@ -1,11 +1,13 @@
-"""Bad scenes and killed renders: one clear message, and no half capture taken for a whole one.
+"""Bad scenes, killed renders and full discs: one clear message, and no half capture.
 
 Oracle: the contract itself, word for word where a person has to act on it. A disc that fills is
-in `test_sim_disc`.
+simulated by the one call through which every file of a capture takes its name, `os.replace`,
+which reports that no space is left after some files.
 """
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import subprocess
@@ -52,8 +54,13 @@ BAD_SCENES = {
 }
 
 
-@pytest.mark.parametrize("case", BAD_SCENES)
-@pytest.mark.parametrize("action", ["render", "plan", "preview", "calibrate"])
+@pytest.mark.parametrize(
+    ("case", "action"),
+    [
+        *((case, "render") for case in BAD_SCENES),
+        *(("no TOML", action) for action in ("plan", "preview", "calibrate")),
+    ],
+)
 def test_a_bad_scene_is_one_line(
     case: str, action: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -69,15 +76,6 @@ def test_a_bad_scene_is_one_line(
     for word in (str(path), *words):
         assert word in shown.err
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_a_severity_out_of_range_names_the_range(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "out"
-    assert main(["sim", "render", "capture0", "-o", str(out), "--severity", "9"]) == 2
-    assert "severity: 9.0 is not in 1..5" in capsys.readouterr().err
-    assert not out.exists()
 
 
 def _finished(folder: Path) -> int:
@@ -132,3 +130,39 @@ def test_a_killed_worker_is_one_clear_error(
     assert "the same command continues" in str(caught.value)
     assert not out.exists()
     assert not set(psutil.Process().children()) - before  # the other worker was ended
+
+
+DISC_FRAMES = 10
+
+
+# Frames wait as one file each; then come images, tracks and the metadata of the capture.
+@pytest.mark.parametrize("files", [3, DISC_FRAMES + 4, DISC_FRAMES + 5 * DISC_FRAMES + 2])
+def test_a_disc_that_fills(
+    files: int, make_scene: Callable[..., Scene], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene, out = make_scene(), tmp_path / "full"
+    honest, written = os.replace, []
+
+    def replace(source: str, target: str) -> None:
+        # What lies outside, the cache of skins for instance, has its own disc.
+        if tmp_path in Path(target).parents:
+            if len(written) >= files:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            written.append(target)
+        honest(source, target)
+
+    monkeypatch.setattr(os, "replace", replace)
+    with pytest.raises(HwpError, match="No space left") as caught:
+        render_capture(scene, out, frame_count=DISC_FRAMES, size=SIZE, workers=1, free_view=False)
+    assert str(caught.value).count("\n") == 0
+    assert not out.exists()
+    assert not list(tmp_path.glob("*.lock")) + list(tmp_path.glob(".*.lock"))
+    with pytest.raises(BadInput):
+        open_capture(out)
+    monkeypatch.setattr(os, "replace", honest)
+    # With space again the same call goes on from the frames that were finished.
+    whole = render_capture(
+        scene, out, frame_count=DISC_FRAMES, size=SIZE, workers=1, free_view=False
+    )
+    assert len(whole) == DISC_FRAMES
+    assert [path.name for path in tmp_path.iterdir()] == ["full"]

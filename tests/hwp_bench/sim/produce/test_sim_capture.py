@@ -12,9 +12,15 @@ import pytest
 from hwp_bench.base.errors import UsageError
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.sim.effects import plan_frame
-from hwp_bench.sim.produce.capture import frame_file, render_capture, render_key, true_hands
+from hwp_bench.sim.produce.capture import (
+    ensure_suite,
+    frame_file,
+    render_capture,
+    render_key,
+    suite,
+    true_hands,
+)
 from hwp_bench.sim.produce.estimates import EASY_ERROR, estimate_hands
-from hwp_bench.sim.produce.suites import ensure_suite, suite
 from hwp_bench.sim.scene.scene import Scene
 
 SceneMaker = Callable[..., Scene]
@@ -33,7 +39,7 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     path = tmp_path_factory.mktemp("sim") / "tiny"
     scene = parse_scene(SINGLE, where="tiny.toml")
-    render_capture(scene, path, frame_count=FRAMES, size=SIZE, workers=1, exr=True)
+    render_capture(scene, path, frame_count=FRAMES, size=SIZE, workers=1, exr=True, free_view=False)
     return path
 
 
@@ -186,13 +192,13 @@ def test_a_suite_in_the_cache_is_not_rendered_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make_scene: SceneMaker
 ) -> None:
     from hwp_bench.sim.produce import capture as production
-    from hwp_bench.sim.produce import suites
+    from hwp_bench.sim.produce import capture as suites
 
     item = suites.SuiteItem(make_scene(), 10, 32)
     monkeypatch.setattr(suites, "suite", lambda name: (item,))
-    (first,) = ensure_suite("smoke", tmp_path, workers=1)
+    (first,) = ensure_suite("smoke", tmp_path, workers=1, free_view=False)
     monkeypatch.setattr(production, "render_waiting", None)
-    assert ensure_suite("smoke", tmp_path) == [first]
+    assert ensure_suite("smoke", tmp_path, free_view=False) == [first]
 
 
 def test_masks_err_at_borders_and_occluders(make_scene: SceneMaker) -> None:

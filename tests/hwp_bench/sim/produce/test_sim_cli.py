@@ -49,6 +49,7 @@ def test_render_and_preview(
 ) -> None:
     out = tmp_path / "capture"
     extent = ["--frames", "10", "--size", "32", "--severity", "2", "--workers", "1"]
+    extent += ["--no-free-view"]
     assert main(["sim", "render", str(scene_file), "-o", str(out), *extent]) == 0
     assert (out / "capture.json").is_file()
     assert main(["sim", "render", str(scene_file), "-o", str(out), *extent]) == 2
@@ -69,6 +70,17 @@ def test_render_and_preview(
         ["render", "--suite", "mini", "--size", "64"],
         ["render", "capture0", "-o", "x", "--severity", "9"],
         ["preview", "capture0", "--frames", "1"],
+        # Numbers that no memory holds.
+        *(
+            [*words, f"{option}={value}"]
+            for words in (["plan", "capture0"], ["render", "capture0", "-o", "x"])
+            for option, value in (
+                ("--frames", "1" * 60),
+                ("--frames", "100001"),
+                ("--frames", "-1"),
+                ("--size", "9" * 30),
+            )
+        ),
     ],
 )
 def test_wrong_requests_end_with_status_2(
@@ -81,6 +93,8 @@ def test_wrong_requests_end_with_status_2(
     assert main(["sim", *words]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1
+    if "--severity" in words or any("=" in word for word in words):
+        assert "is not in" in error
     assert list(tmp_path.iterdir()) == []
 
 

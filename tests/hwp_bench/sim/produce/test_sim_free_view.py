@@ -103,7 +103,7 @@ def test_gestures_are_those_that_the_scene_does_not_show(name: str) -> None:
 def test_two_hands_keep_apart_and_fit_into_the_image() -> None:
     from scipy.spatial import cKDTree
 
-    from hwp_bench.sim.scene.motion import intrinsics
+    from hwp_bench.sim.scene.scene import intrinsics
 
     scene = load_scene("capture6")
     for item in free_views(scene, 3):
@@ -165,7 +165,7 @@ def test_the_clip_is_no_part_of_the_capture(
     rendered: Path, make_scene: SceneMaker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from hwp_bench.sim.produce import capture as production
-    from hwp_bench.sim.produce import suites
+    from hwp_bench.sim.produce import capture as suites
 
     item = suites.SuiteItem(make_scene(), COUNT, SIZE)
     (bare,) = suites.ensure_suite([item], tmp_path, workers=1, free_view=False)

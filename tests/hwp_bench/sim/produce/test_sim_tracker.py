@@ -11,26 +11,30 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hwp_bench.base.errors import BadInput
 from hwp_bench.hands import load_template
 from hwp_bench.hands.poses import RestSkeleton, posed_skeleton, rest_skeleton, turned
 from hwp_bench.sim.effects import plan_frame
-from hwp_bench.sim.light.lights import focus_point
 from hwp_bench.sim.produce.capture import true_hands
-from hwp_bench.sim.produce.estimates import estimate_hands
-from hwp_bench.sim.produce.tracker import (
-    HABIT,
+from hwp_bench.sim.produce.estimates import (
     MEMORY,
+    TRACKER_HABIT,
     ParameterErrors,
     curl,
     edge_on,
+    estimate_hands,
     growth,
     landmark_noise,
     parameter_errors,
     wandering,
 )
-from hwp_bench.sim.scene.motion import hand_parameters, moment_of_key
-from hwp_bench.sim.scene.scene import Estimator, HandKey, Scene, with_effects
+from hwp_bench.sim.scene.scene import (
+    Estimator,
+    HandKey,
+    Scene,
+    hand_parameters,
+    moment_of_key,
+    with_effects,
+)
 
 SceneMaker = Callable[..., Scene]
 FRAMES = 60
@@ -50,7 +54,7 @@ def _held(count: int, gesture: str, turn: float = 180.0) -> tuple[np.ndarray, np
         turn: about the fingers' direction, degrees; 180 shows the palm.
     """
     moment = moment_of_key(HandKey(gesture, turn=turn))
-    pose, transl = hand_parameters(moment, "right", _hand().joints, focus_point())
+    pose, transl = hand_parameters(moment, "right", _hand().joints)
     return np.tile(pose, (count, 1, 1)), np.tile(transl, (count, 1))
 
 
@@ -72,7 +76,7 @@ def test_noise_remembers_as_it_says(step: float) -> None:
         expected = (1.0 + x) * np.exp(-x)
         assert (walk[lag:] * walk[:-lag]).mean() == pytest.approx(expected, abs=0.03)
     noise = landmark_noise(np.random.default_rng(3), 400, 10.0)
-    assert np.square(noise.mean(axis=0)).mean() == pytest.approx(HABIT, abs=0.05)
+    assert np.square(noise.mean(axis=0)).mean() == pytest.approx(TRACKER_HABIT, abs=0.05)
 
 
 def test_fists_and_edges_are_harder() -> None:
@@ -147,18 +151,3 @@ def test_scenes_scale_the_errors_and_flag_the_failures(
     often, _, valid = estimated(Estimator("tracker", failures=0.3))
     assert 0.1 < 1.0 - valid.mean() < 0.5
     assert np.abs(often[~valid]).mean() > 1.5 * np.abs(often[valid]).mean()
-
-
-@pytest.mark.parametrize(
-    ("lines", "field"),
-    [
-        ('kind = "oracle"', "estimator.kind"),
-        ('kind = "tracker"\nscale = -1.0', "estimator.scale"),
-        ('kind = "tracker"\nfailures = 0.9', "estimator.failures"),
-        ("scale = 1.0", "estimator.kind"),
-    ],
-)
-def test_a_wrong_estimator_is_named(make_scene: SceneMaker, lines: str, field: str) -> None:
-    with pytest.raises(BadInput) as caught:
-        make_scene(("[track]", f"[estimator]\n{lines}\n\n[track]"))
-    assert caught.value.field == field

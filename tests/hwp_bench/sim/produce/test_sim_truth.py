@@ -19,12 +19,10 @@ from hwp_bench.hands.anchors import HandSurfaces
 from hwp_bench.hands.raster import overlap
 from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.request import frame_choice, known_oracle_inputs, open_request, write_request
-from hwp_bench.sim.hand.off_template import SubjectAnatomy
-from hwp_bench.sim.light.lights import focus_point
+from hwp_bench.sim.hand.anatomy import SubjectAnatomy
 from hwp_bench.sim.produce.capture import render_capture
 from hwp_bench.sim.produce.truth import add_subject_mesh, subject_template, subject_templates
-from hwp_bench.sim.scene.motion import hand_parameters, moment_of_key
-from hwp_bench.sim.scene.scene import HandKey, Scene
+from hwp_bench.sim.scene.scene import HandKey, Scene, hand_parameters, moment_of_key
 from hwp_bench.sim.subject.hand import subject_hand, template_vertices
 from hwp_bench.sim.subject.subject import Subject
 
@@ -44,7 +42,7 @@ knuckles = 1.5
 
 
 @pytest.fixture
-def capture(make_scene: SceneMaker, tmp_path: Path) -> Capture:
+def capture(make_scene: SceneMaker, tmp_path: Path, small_paintings: None) -> Capture:
     scene = make_scene(("age = 31.0\n", PERSON))
     render_capture(
         scene, tmp_path / "tiny", frame_count=FRAMES, size=SIZE, workers=1, free_view=False
@@ -113,8 +111,8 @@ def test_posed_by_the_capture_it_is_where_the_subject_is(
     own = subject_template(hand)
     for gesture in ("open", "fist"):
         moment = moment_of_key(HandKey(gesture, turn=40.0, tilt=25.0, roll=10.0))
-        rendered = hand_parameters(moment, side, hand.joints, focus_point())
-        stated = hand_parameters(moment, side, hand.model_joints, focus_point())
+        rendered = hand_parameters(moment, side, hand.joints)
+        stated = hand_parameters(moment, side, hand.model_joints)
         exact = hand.pose(*rendered)[0][: len(own.vertices)]
         posed = template_vertices(own.to_torch(torch.float64), stated[0], hand.betas, stated[1])
         # Angles are counted along the bones of either skeleton, and relief along posed normals.

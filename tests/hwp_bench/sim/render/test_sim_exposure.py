@@ -16,12 +16,10 @@ from hypothesis import strategies as st
 from tiny_scene import CLEAN, LIGHT, OBJECT
 
 from hwp_bench.base.colors import LUMINANCE
-from hwp_bench.base.errors import BadInput
 from hwp_bench.sim.effects import plan_frame
-from hwp_bench.sim.geometry.rays import RenderCost
-from hwp_bench.sim.render import exposure as metering
-from hwp_bench.sim.render.exposure import metered_gain
-from hwp_bench.sim.render.frame import render_frame
+from hwp_bench.sim.geometry.surface import RenderCost
+from hwp_bench.sim.render import frame as metering
+from hwp_bench.sim.render.frame import metered_gain, render_frame
 from hwp_bench.sim.scene.scene import Scene, with_effects
 from hwp_bench.sim.sensor import AutoControl, Sensor, sharpened
 
@@ -54,22 +52,6 @@ def test_later_fields_are_in_the_scene_only_where_they_say_something(
     after = make_scene(("noise = 0.01\n", ""), ("[light]", lines + table + "[light]"))
     assert after.to_json()["sensor"]["auto"]["level"] == 0.3
     assert after.digest != before.digest
-
-
-@pytest.mark.parametrize(
-    ("lines", "field"),
-    [
-        ("sharpening = -0.1", "sensor.sharpening"),
-        ("[sensor.auto]\nlevel = 0.0", "sensor.auto.level"),
-        ("[sensor.auto]\nlag = 0.0", "sensor.auto.lag"),
-        ("[sensor.auto]\niso = 100", "sensor.auto.iso"),
-    ],
-)
-def test_a_wrong_setting_is_named(make_scene: SceneMaker, lines: str, field: str) -> None:
-    table = f"[sensor]\nnoise = 0.01\n{lines}\n[light]"
-    with pytest.raises(BadInput) as caught:
-        make_scene(("noise = 0.01\n", ""), ("[light]", table))
-    assert caught.value.field == field
 
 
 def test_the_level_is_reached(automatic: Callable[[AutoControl], Scene]) -> None:
@@ -123,7 +105,11 @@ def test_a_frame_and_its_clean_version_get_the_same_gain(
         assert (with_it.rgb != without.rgb).any()
 
 
-def test_the_camera_wanders_by_its_seed(automatic: Callable[[AutoControl], Scene]) -> None:
+def test_the_camera_wanders_by_its_seed(
+    automatic: Callable[[AutoControl], Scene], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # What is metered has no weight here, so that nothing need be rendered for it.
+    monkeypatch.setattr(metering, "_seen", lambda look: np.full(3, 0.1))
     auto = AutoControl(exposure=0.0, white_balance=0.0, wander=0.2)
     scene = automatic(auto)
     times = np.arange(0.0, 60.0, 0.5)

@@ -14,13 +14,11 @@ import pytest
 from tiny_scene import BLUR, CLEAN, LIGHT, OBJECT
 
 from hwp_bench.sim.effects import hands_at, plan_frame
-from hwp_bench.sim.geometry.rays import RenderCost
-from hwp_bench.sim.geometry.surface import Surface
+from hwp_bench.sim.geometry.surface import RenderCost, Surface
 from hwp_bench.sim.light.lights import FOCUS_DISTANCE
 from hwp_bench.sim.render.frame import SUPERSAMPLING, SimulatedFrame, render_frame
 from hwp_bench.sim.render.stage import Stage
-from hwp_bench.sim.scene.motion import intrinsics, pixel_rays, viewmat
-from hwp_bench.sim.scene.scene import Scene
+from hwp_bench.sim.scene.scene import Scene, intrinsics, pixel_rays, viewmat
 from hwp_bench.sim.sensor import Sensor
 
 SceneMaker = Callable[..., Scene]

@@ -14,8 +14,9 @@ from hwp_bench.base.errors import BadInput
 from hwp_bench.hands import load_template
 from hwp_bench.hands.poses import LIMITS, finger_pose, gesture, gestures, within_limits
 from hwp_bench.sim.light.lights import focus_point
-from hwp_bench.sim.scene.motion import (
+from hwp_bench.sim.scene.scene import (
     HandMoment,
+    Scene,
     hand_parameters,
     heading_matrix,
     intrinsics,
@@ -23,7 +24,6 @@ from hwp_bench.sim.scene.motion import (
     track_moment,
     viewmat,
 )
-from hwp_bench.sim.scene.scene import Scene
 from hwp_bench.sim.scene_files import parse_scene
 from hwp_bench.sim.subject.hand import template_vertices
 
@@ -57,7 +57,7 @@ def test_rounds_differ_but_repeat_exactly(make_scene: SceneMaker) -> None:
 def test_heading_zero_shows_the_back_with_fingers_up(side: str) -> None:
     template = load_template("anny", side)
     moment = HandMoment(gesture("flat"), np.zeros(3), np.zeros(3))
-    pose, transl = hand_parameters(moment, side, template.joints, focus_point())
+    pose, transl = hand_parameters(moment, side, template.joints)
     vertices = template_vertices(template.to_torch(), pose, np.zeros(10), transl)
     tips = vertices[template.fingertips]
     assert tips[2, 1] < vertices[:, 1].mean() - 0.05  # up is -y

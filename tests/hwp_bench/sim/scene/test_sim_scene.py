@@ -11,12 +11,15 @@ from tiny_scene import SINGLE
 
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.capture.splits import contiguous_split
-from hwp_bench.sim.produce.suites import suite, suite_names
-from hwp_bench.sim.scene.motion import clean_share, level, moments, severity
+from hwp_bench.sim.produce.capture import suite, suite_names
 from hwp_bench.sim.scene.scene import (
     CLEAN_FROM,
     MIN_CLEAN_SHARE,
     Scene,
+    clean_share,
+    level,
+    moments,
+    severity,
     with_effects,
     with_severity,
     with_subject,
@@ -94,6 +97,59 @@ def test_damage_is_named(make_scene: SceneMaker, old: str, new: str, field: str)
     with pytest.raises(BadInput) as caught:
         make_scene((old, new))
     assert caught.value.where == "tiny.toml"
+    assert field in str(caught.value)
+
+
+#: Tables with a field at fault: what stands before `[track]`, and the field.
+WRONG = (
+    ("[sensor]\njpeg_quality = 50", "sensor.noise"),
+    ("[sensor]\nnoise = 0.3", "sensor.noise"),
+    ("[sensor]\nnoise = 0.01\njpeg_quality = 1.5", "sensor.jpeg_quality"),
+    ("[sensor]\nnoise = 0.01\njpeg_quality = 101", "sensor.jpeg_quality"),
+    ("[sensor]\nnoise = 0.01\nrolling_shutter = 0.2", "sensor.rolling_shutter"),
+    ("[sensor]\nnoise = 0.01\nrolling_shutter = -0.01", "sensor.rolling_shutter"),
+    ("[sensor]\nnoise = 0.01\nlens = 1", "sensor.lens"),
+    ("[sensor]\nnoise = 0.01\nsharpening = -0.1", "sensor.sharpening"),
+    ("[sensor]\nnoise = 0.01\n[sensor.auto]\nlevel = 0.0", "sensor.auto.level"),
+    ("[sensor]\nnoise = 0.01\n[sensor.auto]\nlag = 0.0", "sensor.auto.lag"),
+    ("[sensor]\nnoise = 0.01\n[sensor.auto]\niso = 100", "sensor.auto.iso"),
+    ("[[light.lamps]]\nplace = [0.1, 0.0, 0.0]\nstrength = 1.0", "light.lamps[0].place"),
+    ("[[light.lamps]]\nplace = [1.0, 0.0, 0.0]", "light.lamps[0].strength"),
+    ("[light.room]\nleft = [2.0, 0.0, 0.0]", "light.room.left[0]"),
+    ("[light.room]\nnorth = [1.0, 0.0, 0.0]", "light.room.north"),
+    ('[estimator]\nkind = "oracle"', "estimator.kind"),
+    ('[estimator]\nkind = "tracker"\nscale = -1.0', "estimator.scale"),
+    ('[estimator]\nkind = "tracker"\nfailures = 0.9', "estimator.failures"),
+    ("[estimator]\nscale = 1.0", "estimator.kind"),
+    ("[subject.anatomy]\njoint_shift = 9.0", "subject.anatomy.joint_shift"),
+    ("[subject.anatomy]\nfinger_lengths = [1.0, 1.0, 1.0, 1.0, 2.0]", "finger_lengths[4]"),
+    ("[subject.anatomy]\npalm = [1.0, 1.0]", "subject.anatomy.palm"),
+    ("[subject.anatomy]\nnail_lenght = 2.0", "subject.anatomy.nail_lenght"),
+    ("[behind]\nghost = 1", "behind.ghost"),
+    ("[behind.face]\nsize = 9.0", "behind.face.size"),
+    ('[behind.arm]\nside = "top"', "behind.arm.side"),
+    ("[behind.clutter]\ncount = 0", "behind.clutter.count"),
+    ("[subject.looks]\nhair = 2.0", "subject.looks.hair"),
+    ('[subject.looks]\narm = "wooden"', "subject.looks.arm"),
+    ("[subject.looks]\nbeard = 1.0", "subject.looks.beard"),
+    ('[subject.looks]\nrings = [{ finger = "toe" }]', "looks.rings[0].finger"),
+    ("[subject.looks]\npolish = [{ colors = [[1, 0, 0], [0, 0, 1]] }]", "polish[0].colors"),
+    (
+        '[subject.looks]\ngloves = [{ kind = "work" }, { kind = "work", side = "left" }]',
+        "subject.looks.gloves",
+    ),
+    (
+        '[subject.looks]\ntattoos = [{ motif = "vine", ink = [0.1, 0.2, 3.0] }]',
+        "looks.tattoos[0].ink",
+    ),
+)
+
+
+@pytest.mark.parametrize(("table", "field"), WRONG)
+def test_a_wrong_field_of_a_table_is_named(make_scene: SceneMaker, table: str, field: str) -> None:
+    noise = ("noise = 0.01\n", "") if table.startswith("[sensor]") else ("seed = 5", "seed = 5")
+    with pytest.raises(BadInput) as caught:
+        make_scene(noise, ("[track]", f"{table}\n[track]"))
     assert field in str(caught.value)
 
 
