@@ -21,7 +21,7 @@ from hwp_bench.metrics.pixels import decibels
 from hwp_bench.sim.effects import hands_at, plan_frame
 from hwp_bench.sim.geometry.surface import RenderCost
 from hwp_bench.sim.render.frame import carry_out, render_frame
-from hwp_bench.sim.render.stage import Stage
+from hwp_bench.sim.render.stage import RenderStage
 from hwp_bench.sim.scene.scene import intrinsics, pixel_rays, viewmat
 from hwp_bench.sim.scene_files import load_scene
 from hwp_bench.sim.subject.hand import MOVING
@@ -78,7 +78,7 @@ def _rays_ratio(size: int) -> float:
     if loaded is None:
         return 1.0
     scene = load_scene("capture3")
-    surface = Stage(scene, RenderCost()).surface(hands_at(scene, 0.0), MOVING)
+    surface = RenderStage(scene, RenderCost()).surface(hands_at(scene, 0.0), MOVING)
     view = viewmat(scene, 0.0)
     origin, directions = pixel_rays(intrinsics(scene, size), view, (0, size, 0, size), 1)
     best = [np.inf, np.inf]

@@ -3,7 +3,7 @@
 Run from the repository: `python -m benchmarks.importer_errors FOLDER` imports the clips that
 `python -m benchmarks.tracker_errors --video VIDEO --landmarks NPZ --keep FOLDER` left there and
 prints how far the hands are from the true ones. `--set NAME=VALUE` changes a number of
-`hwp_bench.importers.video.FitSettings`, for example `--set texture=false`. About two minutes
+`hwp_bench.importers.video.SolveSettings`, for example `--set texture=false`. About two minutes
 of one core for each clip.
 
 `--harder` adds two clips, which are rendered where FOLDER does not hold them: one in hard light,
@@ -27,7 +27,7 @@ from benchmarks.tracker_clips import clip_source, make_clip, true_hand
 from hwp_bench.cli.options import overrides
 from hwp_bench.hands import HandTemplate, PosedHand, load_template, pose_hand
 from hwp_bench.hands.skeleton import FINGERS, HandParameters, finger_joints
-from hwp_bench.importers.video import FitSettings
+from hwp_bench.importers.video import SolveSettings
 from hwp_bench.importers.video.api import fit_video
 from hwp_bench.methods.settings import settings_from
 
@@ -98,7 +98,7 @@ def hand_errors(
     )
 
 
-def import_errors(folder: Path, clip: str, settings: FitSettings) -> tuple[HandErrors, float]:
+def import_errors(folder: Path, clip: str, settings: SolveSettings) -> tuple[HandErrors, float]:
     """Import a kept clip: its errors, and the processor seconds that it took."""
     source, options = clip_source(clip, folder, settings)
     start = time.process_time()
@@ -109,10 +109,10 @@ def import_errors(folder: Path, clip: str, settings: FitSettings) -> tuple[HandE
     return hand_errors(hand, truth, options.focal, load_template("anny", "right"), own), taken
 
 
-def changed(settings: FitSettings, changes: list[str]) -> FitSettings:
+def changed(settings: SolveSettings, changes: list[str]) -> SolveSettings:
     """Set fields given as NAME=VALUE; refuses names and values that are wrong."""
     values = {**asdict(settings), **overrides(changes)}
-    return settings_from(FitSettings, values, "--set")
+    return settings_from(SolveSettings, values, "--set")
 
 
 def main(arguments: list[str]) -> int:
@@ -122,7 +122,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--harder", action="store_true", help="also hard light, and another mesh")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", dest="changes")
     options = parser.parse_args(arguments)
-    settings = changed(FitSettings(), options.changes)
+    settings = changed(SolveSettings(), options.changes)
     if options.harder:
         errors = landmark_errors(kept_clip(options.folder))
         for seed, kind in HARDER:

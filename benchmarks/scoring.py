@@ -19,7 +19,7 @@ import numpy as np
 from scipy import ndimage
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from hwp_bench.metrics.score import Frame, score_frames
+from hwp_bench.metrics.score import ScoredFrame, score_frames
 
 #: Different frames that are made; the list of frames goes round them.
 DISTINCT = 16
@@ -33,7 +33,7 @@ BUDGET_S = 15.0
 BUDGETS = {0.25: 0.5, 1.0: 0.85}
 
 
-def make_frames(size: int, share: float) -> list[Frame]:
+def make_frames(size: int, share: float) -> list[ScoredFrame]:
     """Noisy predictions of a textured disc (or, for share 1, of the whole frame)."""
     rng = np.random.default_rng(0)
     rows, columns = np.mgrid[:size, :size] - (size - 1) / 2
@@ -44,25 +44,25 @@ def make_frames(size: int, share: float) -> list[Frame]:
         target = rng.integers(0, 256, (size, size, 3), dtype=np.uint8)
         noise = rng.normal(0.0, 12.0, target.shape)
         prediction = np.clip(np.rint(target + noise), 0, 255).astype(np.uint8)
-        frames.append(Frame(prediction, target, mask.astype(np.uint8) * 255))
+        frames.append(ScoredFrame(prediction, target, mask.astype(np.uint8) * 255))
     return frames
 
 
-def cycle(frames: list[Frame], count: int) -> Iterator[Frame]:
+def cycle(frames: list[ScoredFrame], count: int) -> Iterator[ScoredFrame]:
     for index in range(count):
         yield frames[index % len(frames)]
 
 
-def run_ours(frames: list[Frame], count: int, workers: int) -> None:
+def run_ours(frames: list[ScoredFrame], count: int, workers: int) -> None:
     score_frames(cycle(frames, count), workers=workers)
 
 
-def run_scikit_image(frames: list[Frame], count: int) -> None:
+def run_scikit_image(frames: list[ScoredFrame], count: int) -> None:
     for frame in cycle(frames, count):
         plain_scores(frame)
 
 
-def plain_scores(frame: Frame) -> dict[str, float]:
+def plain_scores(frame: ScoredFrame) -> dict[str, float]:
     """PSNR and SSIM of both protocols as one writes them down with scikit-image."""
     assert isinstance(frame.prediction, np.ndarray)
     prediction, target = frame.prediction / 255.0, frame.target / 255.0
@@ -93,7 +93,7 @@ def plain_scores(frame: Frame) -> dict[str, float]:
     }
 
 
-def check_agreement(frames: list[Frame]) -> None:
+def check_agreement(frames: list[ScoredFrame]) -> None:
     """Stop where the two loops do not compute the same numbers."""
     for frame, scores in zip(frames, score_frames(frames), strict=True):
         for name, value in plain_scores(frame).items():

@@ -17,7 +17,7 @@ from benchmarks.landmark_errors import LandmarkErrors
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.hands import HandTemplate, load_template, pose_hand
 from hwp_bench.hands.skeleton import HandParameters
-from hwp_bench.importers.video import FitSettings, VideoImport
+from hwp_bench.importers.video import SolveSettings, VideoImport
 from hwp_bench.importers.video.api import fit_video
 from hwp_bench.importers.video.source import VideoSource, read_source
 from hwp_bench.sim.produce.capture import render_capture
@@ -140,11 +140,11 @@ def true_hand(root: Path) -> tuple[HandTemplate, HandParameters]:
 
 
 def clip_source(
-    clip: str, keep: Path, settings: FitSettings | None = None
+    clip: str, keep: Path, settings: SolveSettings | None = None
 ) -> tuple[VideoSource, VideoImport]:
     """A kept clip as the importer reads it, and the choices, among them the true focal length."""
     capture = open_capture(keep / clip)
-    focal, fit = float(capture.cameras.Ks[0][0, 0]), settings or FitSettings()
+    focal, fit = float(capture.cameras.Ks[0][0, 0]), settings or SolveSettings()
     options = VideoImport(side="right", focal=focal, size=capture.info.width, fit=fit)
     return read_source(keep / f"{clip}.avi", _landmarks(clip, keep), options), options
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hwp_bench.importers.shared.landmarks import HandTracks, read_landmarks, write_hand_tracks
-from hwp_bench.importers.video import FitSettings, ImportedClip, VideoImport, import_video
+from hwp_bench.importers.video import ImportedClip, SolveSettings, VideoImport, import_video
 
 #: Shift of the mirror image to the left when it is apart, and to the right when it is nearest, px.
 APART, NEAR = 170.0, 150.0
@@ -137,9 +137,9 @@ def main(arguments: list[str] | None = None) -> int:
     composed = compose(
         args.video, args.landmarks, args.folder, frames=args.frames, stride=args.stride
     )
-    fit = FitSettings()
+    fit = SolveSettings()
     if args.quick:
-        fit = FitSettings(
+        fit = SolveSettings(
             start_steps=60,
             landmark_steps=90,
             contour_steps=20,

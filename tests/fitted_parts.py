@@ -8,15 +8,15 @@ from painted import SilentReport, masked_psnr
 from hwp_bench.capture import Capture
 from hwp_bench.methods.contract import Budget, TrainingCapture
 from wildghand.gaussians.training import load_frames
-from wildghand.plain.recipe import Batch, Material, RecipeMethod
+from wildghand.plain.recipe import Batch, FitInputs, RecipeMethod
 
 
-def material_of(training: TrainingCapture) -> Material:
+def material_of(training: TrainingCapture) -> FitInputs:
     """The material of a fit on the CPU, seed 0."""
-    return Material(training, load_frames(training), 0, torch.device("cpu"))
+    return FitInputs(training, load_frames(training), 0, torch.device("cpu"))
 
 
-def batch_of(material: Material, *rows: int, fraction: float = 0.0) -> Batch:
+def batch_of(material: FitInputs, *rows: int, fraction: float = 0.0) -> Batch:
     """Some rows of the training frames."""
     frames, device, index = material.frames, material.device, torch.tensor(rows)
     images, masks = frames.images_on(device)(index), frames.masks_on(device)(index)

@@ -1,4 +1,4 @@
-"""Fits that are drawn otherwise with evidence and fill, and a light to compare under."""
+"""Fits that are drawn otherwise with visibility and fill, and a light to compare under."""
 
 from __future__ import annotations
 

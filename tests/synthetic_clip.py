@@ -15,15 +15,15 @@ from hwp_bench.hands.articulation import joint_axes
 from hwp_bench.hands.raster import draw_silhouette
 from hwp_bench.hands.template import boundary_vertices
 from hwp_bench.importers.shared.landmarks import Landmarks
-from hwp_bench.importers.video import FitSettings
+from hwp_bench.importers.video import SolveSettings
 
 WIDTH, HEIGHT, FOCAL, FPS = 320, 240, 260.0, 30.0
 SKIN, WALL, CUP = (205, 150, 120), (90, 110, 140), (40, 160, 60)
 
 
-def landmark_import(steps: int, outline_steps: int) -> FitSettings:
+def landmark_import(steps: int, outline_steps: int) -> SolveSettings:
     """An import that is only as good as the landmarks: few steps, no texture, no pictures."""
-    return FitSettings(
+    return SolveSettings(
         start_steps=steps,
         landmark_steps=steps,
         contour_steps=outline_steps,

@@ -11,7 +11,7 @@ from benchmarks.importer_errors import changed, hand_errors
 from benchmarks.tracker_clips import KINDS, scene_text
 from hwp_bench.hands import load_template
 from hwp_bench.hands.skeleton import HandParameters
-from hwp_bench.importers.video import FitSettings
+from hwp_bench.importers.video import SolveSettings
 from hwp_bench.sim.hand.anatomy import SubjectAnatomy
 from hwp_bench.sim.scene_files import parse_scene
 
@@ -57,7 +57,7 @@ def test_harder_clips_show_what_their_names_say() -> None:
 
 
 def test_settings_keep_their_types() -> None:
-    settings = changed(FitSettings(), ["texture=false", "contour_rounds=2"])
+    settings = changed(SolveSettings(), ["texture=false", "contour_rounds=2"])
     assert settings.texture is False
     assert settings.contour_rounds == 2
     assert isinstance(settings.contour_rounds, int)

@@ -61,6 +61,5 @@ _.blur_deviation  # the table CUES names it; getattr reads it
 _.misplacement_deviation  # the table CUES names it; getattr reads it
 _.hidden_deviation  # the table CUES names it; getattr reads it
 _.memo  # pickle.Unpickler reads it
-_.found_inf  # torch's fused Adam reads it
 REACH_X  # a row of the rasterizer's records, named for the order of the rows
 _.thread_type  # the decoder reads how it may share its work

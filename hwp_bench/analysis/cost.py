@@ -171,7 +171,7 @@ def method_costs(
 
 
 def _mean(values: Iterable[float | None]) -> float | None:
-    """The mean of what is known; None where nothing is, or the mean is no number."""
+    """The mean of what is known; None where nothing is, or the mean is not finite."""
     known = [value for value in values if value is not None]
     mean = float(np.mean(known)) if known else math.nan
     return mean if math.isfinite(mean) else None

@@ -247,7 +247,7 @@ def _expected(kind: Any, metas: tuple[Any, ...]) -> str:
         size = f"at least {least:,}" if most is None else f"{least:,} to {most:,}"
         return f"{words[origin or kind]} of {size} {'characters' if kind is str else 'entries'}"
     sides = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
-    # What `_bounds` has for 0 and for every float are no words.
+    # `_bounds` has no words for 0 and for every float.
     strict = {("ge", _LEAST): ("gt", 0.0), ("le", -_LEAST): ("lt", 0.0)}
     found = (strict.get(item, item) for item in rules.items() if abs(item[1]) < _LARGEST)
     limits: dict[str, float] = dict(found)

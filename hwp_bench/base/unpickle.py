@@ -341,7 +341,7 @@ def _object_reconstructor(made: Any, base: Any, state: Any) -> Any:
 
 
 def _admitted() -> dict[str, Any]:
-    """What a pickle may name, and what it gets: functions that take no state."""
+    """Functions without state that stand for the names which a pickle may have."""
     names: dict[str, Any] = {
         "numpy.ndarray": _ndarray,
         "numpy.dtype": _Dtype,

@@ -52,7 +52,7 @@ def refuse_changed(capture: Capture, kinds: Iterable[str] = ("frames", "masks"))
 
 
 def _changed(capture: Capture, part: str, digest: str) -> BadCapture | None:
-    """What is wrong with the digest that a capture states of a part; None if it is the part's."""
+    """The fault of the digest that a capture states of a part; None if it is the part's."""
     stored = (capture.info.digests or {}).get(part)
     if stored == digest:
         return None

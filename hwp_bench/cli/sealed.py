@@ -14,7 +14,7 @@ from hwp_bench.run.engine.options import add_engine_arguments, engine_for, needs
 from hwp_bench.taxonomy import SUITES
 
 if TYPE_CHECKING:
-    from hwp_bench.commitments import Recipe
+    from hwp_bench.commitments import SealedRecipe
 
 _EXAMPLES = """examples:
   hwp-bench sealed make --suite mini -o exam                      # the organiser
@@ -122,7 +122,7 @@ def _make(args: argparse.Namespace) -> int:
     return print_result(args.json, value, [f"{name}: {text}" for name, text in facts.items()])
 
 
-def _recipe(args: argparse.Namespace) -> Recipe:
+def _recipe(args: argparse.Namespace) -> SealedRecipe:
     from hwp_bench.commitments.recipe import recipe_of, suite_recipe
 
     if (args.suite is None) == (not args.scenes):

@@ -1,7 +1,7 @@
 """Hidden frames and seeds that their keeper is bound to: publications and sealed suites."""
 
 from hwp_bench.commitments.publication import Publication, SealedPart, open_sealed, publish
-from hwp_bench.commitments.recipe import Recipe
+from hwp_bench.commitments.recipe import SealedRecipe
 from hwp_bench.commitments.suite import (
     Checked,
     SealedSuite,
@@ -13,8 +13,8 @@ from hwp_bench.commitments.suite import (
 __all__ = [
     "Checked",
     "Publication",
-    "Recipe",
     "SealedPart",
+    "SealedRecipe",
     "SealedSuite",
     "check_revealed",
     "make_suite",

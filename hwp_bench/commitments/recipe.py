@@ -31,7 +31,7 @@ _MAX_FILE = 1_000_000
 
 
 @dataclass(frozen=True)
-class _File:
+class _RecipeFile:
     """The content of a secret's file: 32 bytes in hexadecimal digits."""
 
     secret: Digest
@@ -48,7 +48,7 @@ def write_secret(path: str | os.PathLike[str], secret: str) -> None:
 
 def read_secret(path: str | os.PathLike[str]) -> str:
     """Return the secret (hex) of a file."""
-    return read_strictly(path, SECRET_SCHEMA, _File).secret
+    return read_strictly(path, SECRET_SCHEMA, _RecipeFile).secret
 
 
 def read_strictly(path: str | os.PathLike[str], schema: str, kind: type[Record]) -> Record:
@@ -101,7 +101,7 @@ class RecipeScene:
 
 
 @dataclass(frozen=True)
-class Recipe:
+class SealedRecipe:
     """Everything but the secret that decides the captures of a sealed suite."""
 
     #: Its scenes, each once.
@@ -135,7 +135,7 @@ class Recipe:
                 raise UsageError(f"{scene.name} is another scene", field="scenes", remedy=remedy)
 
 
-def recipe_of(names: Sequence[str], frames: int, size: int) -> Recipe:
+def recipe_of(names: Sequence[str], frames: int, size: int) -> SealedRecipe:
     """Make a recipe of scenes that come with the package."""
     if not 10 <= frames <= 100_000:
         raise UsageError(f"{frames} is not from 10 to 100000", field="--frames")
@@ -145,17 +145,17 @@ def recipe_of(names: Sequence[str], frames: int, size: int) -> Recipe:
         raise UsageError(f"{len(names)} scenes are not from 1 to {MAX_CAPTURES}", field="SCENE")
     known = set(known_scenes())
     digests = {name: load_scene(name).digest if name in known else "" for name in names}
-    return Recipe(tuple(RecipeScene(name, digests[name], frames) for name in names), size)
+    return SealedRecipe(tuple(RecipeScene(name, digests[name], frames) for name in names), size)
 
 
-def suite_recipe(name: str) -> Recipe:
+def suite_recipe(name: str) -> SealedRecipe:
     """Make a recipe of the scenes, frames and size of a suite."""
     items = suite(name)
     rows = [RecipeScene(one.scene.id, one.scene.digest, one.frame_count) for one in items]
-    return Recipe(tuple(rows), items[0].size)
+    return SealedRecipe(tuple(rows), items[0].size)
 
 
-def sealed_items(recipe: Recipe, secret: str) -> tuple[SuiteItem, ...]:
+def sealed_items(recipe: SealedRecipe, secret: str) -> tuple[SuiteItem, ...]:
     """Return the captures of a recipe under a secret, in the recipe's order."""
     return tuple(
         SuiteItem(sealed_scene(load_scene(row.name), secret), row.frames, recipe.size)

@@ -32,7 +32,7 @@ from hwp_bench.commitments.publication import (
 )
 from hwp_bench.commitments.recipe import (
     SECRET_BYTES,
-    Recipe,
+    SealedRecipe,
     derived,
     read_secret,
     read_strictly,
@@ -59,7 +59,7 @@ SUITE = "suite.json"
 class SuitePage:
     """The page that is published before anybody submits: the recipe, and two commitments."""
 
-    recipe: Recipe
+    recipe: SealedRecipe
     #: Binds the secret and the recipe (`secret.secret_commitment`).
     secret_commitment: Digest
     #: Binds test frames and masks of all captures, the public manifest's `commitment`.
@@ -100,7 +100,7 @@ class SealedSuite:
 
 def make_suite(
     out: str | os.PathLike[str],
-    recipe: Recipe,
+    recipe: SealedRecipe,
     *,
     secret: str | None = None,
     workers: int | None = None,
@@ -133,7 +133,7 @@ def suite_salt(secret: str) -> str:
     return derived(secret, "salt").hex()
 
 
-def _page(recipe: Recipe, secret: str, joint: str) -> SuitePage:
+def _page(recipe: SealedRecipe, secret: str, joint: str) -> SuitePage:
     return SuitePage(recipe, secret_commitment(secret, asdict(recipe)), joint, __version__)
 
 

@@ -22,7 +22,7 @@ from hwp_bench.capture import Capture
 from hwp_bench.capture.schema import frame_name
 from hwp_bench.metrics.pixels import decibels, scored_pixels
 from hwp_bench.metrics.protocol import HWP_V1
-from hwp_bench.metrics.score import Frame, Network, score_frames
+from hwp_bench.metrics.score import Network, ScoredFrame, score_frames
 from hwp_bench.results import FrameResult
 
 #: Bytes of a predicted frame: the largest image that is read, four channels, not packed.
@@ -149,7 +149,7 @@ def score_predictions(
 ) -> list[FrameResult]:
     """Score predictions in every protocol."""
     frames = [
-        Frame(one.pixels, target.pixels, target.mask, coverage=target.exact)
+        ScoredFrame(one.pixels, target.pixels, target.mask, coverage=target.exact)
         for target, one in zip(targets, predictions, strict=True)
     ]
     return [

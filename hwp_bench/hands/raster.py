@@ -70,7 +70,7 @@ def mix_corners(
 
 
 def fixed_point(pixels: np.ndarray) -> tuple[list[tuple[int, int]], int]:
-    """Places (P, 2) px as OpenCV draws them: whole numbers, pixel centres at 0, and its `shift`.
+    """Places (P, 2) px as OpenCV draws them: integers, pixel centres at 0, and its `shift`.
 
     What is far off or NaN is drawn outside of every image.
     """

@@ -200,7 +200,7 @@ class _Annotations:
         return self.root / "annotations" / self.split / name
 
     def of_capture(self, kind: str) -> _Record:
-        """What the file of a kind says of the sequence's capture."""
+        """The content of the file of a kind for the sequence's capture."""
         whole = _Record(read_json(self.path(kind), max_bytes=MAX_BYTES), self.path(kind))
         return whole.part(str(self.sequence.capture))
 

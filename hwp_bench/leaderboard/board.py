@@ -369,7 +369,7 @@ def ranks_of(rows: Sequence[BoardRow]) -> tuple[dict[str, Rank], str]:
     runs = group_runs([one for results in compared.values() for one in results])
     ranking = rank_methods(runs, METRIC)
     by_label = {item.standing.label: item for item in ranking.ranks}
-    # What is compared is made anew for each row, so that a run tells which row it is of.
+    # What is compared is made again for each row, so that a run tells which row it is of.
     run_of = {id(one): run.label for run in runs for one in run.seeds.values()}
     found = {name: by_label[run_of[id(own[0])]] for name, own in compared.items()}
     return found, f"{verdict(ranking)} {left_out}".rstrip()

@@ -68,7 +68,7 @@ _SwitchSettings = Annotated[
 
 
 @dataclass(frozen=True)
-class Entry:
+class EntryPoint:
     """How a method is entered, in one of three ways."""
 
     #: `module:callable`.
@@ -127,7 +127,7 @@ class ManifestFields:
 
     #: Short name: letters, digits, `.`, `_`, `-`.
     name: _MethodName
-    entry: Entry
+    entry: EntryPoint
     #: Name in tables; the short name where the file does not say.
     title: Line = ""
     description: Line = ""

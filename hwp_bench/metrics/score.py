@@ -177,7 +177,7 @@ def _lpips(
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class ScoredFrame:
     """One frame to score."""
 
     #: (H, W, 3) uint8; None where there is no prediction that could be scored.
@@ -191,7 +191,7 @@ class Frame:
 
 
 def score_frames(
-    frames: Iterable[Frame],
+    frames: Iterable[ScoredFrame],
     *,
     networks: Mapping[str, Network] | None = None,
     workers: int | None = None,
@@ -199,7 +199,7 @@ def score_frames(
     """Score frames in parallel; one without a prediction has the declared penalties."""
     chosen = networks or {}
 
-    def score(frame: Frame) -> dict[str, float]:
+    def score(frame: ScoredFrame) -> dict[str, float]:
         if frame.prediction is None:
             return penalty(chosen)
         pair = frame.prediction, frame.target, frame.mask

@@ -14,12 +14,12 @@ from hwp_bench.capture import Capture
 from hwp_bench.methods.contract import TrainingCapture
 from joint_pose_fit.method import JointPoseMethod, JointPoseRecipe
 from plain_fit.method import PlainMethod
-from wildghand.plain.recipe import Material, PlainRecipe
+from wildghand.plain.recipe import FitInputs, PlainRecipe
 
 
 def materials(
     make_training: TrainingMaker, hands: str = "both"
-) -> tuple[Material, JointPoseMethod]:
+) -> tuple[FitInputs, JointPoseMethod]:
     return material_of(make_training(hands)), JointPoseMethod({**QUICK, "hold_weight": 0.5})
 
 

@@ -284,7 +284,7 @@ class DynamicPerturbation(nn.Module):
 
 
 @dataclass(frozen=True, eq=False)
-class Perturbation:
+class FramePerturbation:
     """The perturbation of one hand in B frames, for `wildghand.model.dress`."""
 
     #: Where the biases come from.

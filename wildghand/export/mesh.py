@@ -211,7 +211,7 @@ _FINGER, _THUMB = (60.0, 75.0, 45.0), (10.0, 30.0, 35.0)
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class PoseSequence:
     """Poses of one or two hands over time."""
 
     #: (T,) s, rising from 0.
@@ -224,7 +224,9 @@ class Motion:
     down: bool
 
 
-def capture_motion(avatar: WildGHandAvatar, capture: Capture, sides: tuple[str, ...]) -> Motion:
+def capture_motion(
+    avatar: WildGHandAvatar, capture: Capture, sides: tuple[str, ...]
+) -> PoseSequence:
     """Return the motion of a capture; frames in which a hand was not found are left out."""
     hands = {side: capture.hands[side] for side in sides}
     kept = np.flatnonzero(np.all([hand.valid for hand in hands.values()], axis=0))
@@ -234,7 +236,7 @@ def capture_motion(avatar: WildGHandAvatar, capture: Capture, sides: tuple[str, 
         avatar.believed({side: hand.at(frame, side) for side, hand in hands.items()})
         for frame in kept.tolist()
     ]
-    return Motion(
+    return PoseSequence(
         times=(kept - kept[0]) / capture.info.fps,
         poses={side: np.stack([frame[side].pose for frame in frames]) for side in sides},
         transls={side: np.stack([frame[side].transl for frame in frames]) for side in sides},
@@ -242,7 +244,9 @@ def capture_motion(avatar: WildGHandAvatar, capture: Capture, sides: tuple[str, 
     )
 
 
-def closing_motion(templates: Mapping[str, HandTemplate], rest: Mapping[str, HandPose]) -> Motion:
+def closing_motion(
+    templates: Mapping[str, HandTemplate], rest: Mapping[str, HandPose]
+) -> PoseSequence:
     """Return a motion in which the fingers close and open once."""
     times = np.arange(round(SECONDS * FPS) + 1) / FPS
     share = 0.5 - 0.5 * np.cos(2.0 * math.pi * times / SECONDS)
@@ -255,7 +259,7 @@ def closing_motion(templates: Mapping[str, HandTemplate], rest: Mapping[str, Han
         poses[side] = np.zeros((len(times), 16, 3))
         poses[side][:, 1:] = pose_from_joint_angles(torch.from_numpy(angles), axes).numpy()
         transls[side] = np.tile(rest[side].transl, (len(times), 1))
-    return Motion(times, poses, transls, down=False)
+    return PoseSequence(times, poses, transls, down=False)
 
 
 #: Colours are shown as they are: light is in them already.
@@ -276,7 +280,9 @@ class SkinnedHand:
     texture: SkinTexture
 
 
-def skinned_glb_bytes(hands: Mapping[str, SkinnedHand], motion: Motion, generator: str) -> bytes:
+def skinned_glb_bytes(
+    hands: Mapping[str, SkinnedHand], motion: PoseSequence, generator: str
+) -> bytes:
     """Return hands with skeletons, in glTF's axes: y up, metres.
 
     The wrist's node moves the hand; the middle of the motion lies at the origin.
@@ -399,7 +405,7 @@ def _add_motion(
     made: GlbBuilder,
     clip: dict[str, Any],
     times: int,
-    motion: Motion,
+    motion: PoseSequence,
     side: str,
     joints: np.ndarray,
     first: int,

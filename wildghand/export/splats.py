@@ -56,7 +56,7 @@ SH_CONSTANT = 0.28209479177387814
 
 
 @dataclass(frozen=True, eq=False)
-class Standing:
+class PosedCamera:
     """Hands in front of a camera."""
 
     #: By side; in the poses that the fit believes in.
@@ -92,13 +92,13 @@ class SeenGaussians:
         return replace(self, splats=splats, directions=directions)
 
 
-def standing(avatar: WildGHandAvatar, capture: Capture | None, frame: int) -> Standing:
+def standing(avatar: WildGHandAvatar, capture: Capture | None, frame: int) -> PosedCamera:
     """Hands as a frame of a capture shows them; without a capture, as they stand in the studio."""
     if capture is None:
-        return Standing(avatar.studio.posed(), np.eye(4))
+        return PosedCamera(avatar.studio.posed(), np.eye(4))
     shown = capture.hand_poses(frame)
     hands = avatar.believed({side: shown[side] for side in shown_sides(avatar, capture)})
-    return Standing(hands, capture.camera(frame).viewmat)
+    return PosedCamera(hands, capture.camera(frame).viewmat)
 
 
 def turned(
@@ -134,7 +134,7 @@ def middle(splats: PosedGaussians) -> np.ndarray:
     return np.asarray(0.5 * (splats.means.min(axis=0) + splats.means.max(axis=0)), dtype=np.float64)
 
 
-def seen(avatar: WildGHandAvatar, place: Standing) -> SeenGaussians:
+def seen(avatar: WildGHandAvatar, place: PosedCamera) -> SeenGaussians:
     """The Gaussians of hands, and their colours while they turn in front of the camera."""
     front = avatar.pose(place.hands, closed=True, viewmat=place.viewmat)
     front.require_finite()

@@ -24,12 +24,12 @@ from torch import Tensor
 from hwp_bench.methods.contract import Avatar, Camera, HandPose, TrainingCapture
 from hwp_bench.metrics.pixels import scored_pixels
 from hwp_bench.metrics.protocol import HWP_V1
-from wildghand.evidence import ColorChanges, Evidence
 from wildghand.fitting.fit import Component, Fit
 from wildghand.gaussians.training import TrainingClip, TrainingFrames
 from wildghand.light import ShadowTable
 from wildghand.model.model import HandPrediction, WildGHandModel
 from wildghand.network import HandFeatures
+from wildghand.visibility import ColorChanges, Visibility
 
 # How often a fit has seen each frame when the first of its states is kept.
 _FIRST = 2.5
@@ -50,7 +50,7 @@ def choose(
     Args:
         candidates: each with the share by which it must lower the error of the best one before it.
         start: the best one before them, and its error; None: the first of them, at least one.
-        patient: look at all of them; else only until one is no better.
+        patient: look at all of them; else only until one does not improve.
     """
     listed = iter(candidates)
     if start is None:
@@ -98,7 +98,7 @@ class DrawingSeconds(NamedTuple):
 class JudgedDrawings:
     """Validation frames, which no step has seen, and how the model draws them."""
 
-    #: What is drawn; its evidence and changes of colours are put back.
+    #: What is drawn; its visibility and changes of colours are put back.
     model: WildGHandModel
     #: What may be seen of the capture.
     training: TrainingCapture
@@ -132,13 +132,13 @@ class JudgedDrawings:
     def error(
         self,
         predicted: Mapping[int, Predicted],
-        evidence: Evidence | None,
+        visibility: Visibility | None,
         changes: ColorChanges | None,
     ) -> float:
         """Mean squared error of sRGB over the pixels of the hand that scoring looks at."""
         model = self.model
-        before = model.evidence, model.color_changes
-        model.evidence, model.color_changes = evidence, changes
+        before = model.visibility, model.color_changes
+        model.visibility, model.color_changes = visibility, changes
         try:
             squares, pixels = 0.0, 0.0
             for row, hands in predicted.items():
@@ -147,21 +147,21 @@ class JudgedDrawings:
                 squares += float(off[hand].sum())
                 pixels += float(hand.sum())
         finally:
-            model.evidence, model.color_changes = before
+            model.visibility, model.color_changes = before
         return squares / max(pixels, 1.0)
 
     @functools.cached_property
     def seconds(self) -> DrawingSeconds:
         """About how long things take, measured once; nothing of the model changes."""
-        evidence, changes = self.model.evidence, self.model.color_changes
+        visibility, changes = self.model.visibility, self.model.color_changes
         # The first time takes longer than others.
-        self.error({0: self.predict(0, self.features())}, evidence, changes)
+        self.error({0: self.predict(0, self.features())}, visibility, changes)
         begun = time.perf_counter()
         features = self.features()
         shared = time.perf_counter()
         predicted = {0: self.predict(0, features)}
         asked = time.perf_counter()
-        self.error(predicted, evidence, changes)
+        self.error(predicted, visibility, changes)
         return DrawingSeconds(shared - begun, asked - shared, time.perf_counter() - asked)
 
     @functools.cached_property
@@ -321,7 +321,7 @@ class StateChoice(Component):
     """After the last step a fit goes back to an earlier state that draws validation frames better.
 
     States are means of its steps, kept after some of them and each time after twice as many.
-    Evidence is chosen for the state that is kept, and has no say before.
+    Visibility is chosen for the state that is kept, and has no say before.
 
     Args:
         average: the mean of the steps so far. `begin` takes that of the fit.

@@ -19,8 +19,6 @@ import torch
 from torch import Tensor
 
 from hwp_bench.base.colors import linear_to_srgb, srgb_to_linear
-from wildghand.evidence import ColorChanges, kept_share
-from wildghand.evidence.count import read_images, seen_anchors
 from wildghand.fitting.fit import Component, Fit
 from wildghand.fitting.light import Lighting, best_of_each_part
 from wildghand.gaussians.attributes import CHANNELS, SIZES
@@ -32,6 +30,8 @@ from wildghand.light import KnownLight
 from wildghand.light.light import ring_around
 from wildghand.model.model import WildGHandModel
 from wildghand.network.surface import Chart, PlaneSampler
+from wildghand.visibility import ColorChanges, kept_share
+from wildghand.visibility.count import read_images, seen_anchors
 
 #: Frames that are read, spread over the clip: of each part the one that the pre-pass weighs most.
 FRAMES = 16
@@ -92,13 +92,13 @@ class FilledColors:
     shown: Mapping[str, Tensor]
 
     def carried_on(self, shares: Sequence[float]) -> list[ColorChanges | None]:
-        """The changes of colours for some values of `evidence.fill_share`; None: nothing changes.
+        """The changes of colours for some values of `visibility.fill_share`; None: nothing changes.
 
         With a share of 0 the skin around a place says nothing of it, and the other hand all the
         same. Colours are compared at normals that the clip's light knows; without one none change.
         """
         model, clip, light = self.fit.model, self.fit.clip, self.fit.model.light
-        if light is None or not self.fit.settings.evidence.fill_share:
+        if light is None or not self.fit.settings.visibility.fill_share:
             return [None] * len(shares)
         logits = {side: known_logits(model, clip, side, light) for side in model.rigs}
         levels = {side: log_linear(values) for side, values in logits.items()}
@@ -116,10 +116,10 @@ class FilledColors:
 
     @property
     def _joined(self) -> bool:
-        return len(self.fit.model.rigs) == 2 and self.fit.settings.evidence.other_hand
+        return len(self.fit.model.rigs) == 2 and self.fit.settings.visibility.other_hand
 
     def _filled(self, levels: Mapping[str, np.ndarray], share: float) -> dict[str, np.ndarray]:
-        half = (share or self.fit.settings.evidence.fill_share) * len(self.fit.data.frames)
+        half = (share or self.fit.settings.visibility.fill_share) * len(self.fit.data.frames)
         found = {}
         for side, values in levels.items():
             known = self._kept(side, half)

@@ -8,13 +8,13 @@ from hwp_bench.methods.contract import TrainingCapture
 from wildghand.fitting.choice import Averaging, StateChoice, ValidationFrames
 from wildghand.fitting.colors import StartColors
 from wildghand.fitting.disentangle import Dpd, GeometryDropout
-from wildghand.fitting.evidence import FewShown
 from wildghand.fitting.fit import Component, Fit
 from wildghand.fitting.judging import HandMasks, HiddenSkin, Prepass
 from wildghand.fitting.light import Lighting
 from wildghand.fitting.objective import Reconstruction, Regularisers
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
 from wildghand.fitting.start import Person, Poses, StartFromPrior
+from wildghand.fitting.visibility import FewShown
 from wildghand.fitting.weights import MaskWeights, Pao
 from wildghand.model.settings import WildGHandSettings
 
@@ -25,8 +25,8 @@ def components_of(settings: WildGHandSettings) -> list[Component]:
     Hands and frames are corrected and judged first; then come the mean and the choice of the steps,
     as light and colours are found for the state that a fit ends with, and the parts of the loss.
     """
-    pao, evidence = settings.pao, settings.evidence
-    chosen = settings.schedule.validated or evidence.enabled
+    pao, visibility = settings.pao, settings.visibility
+    chosen = settings.schedule.validated or visibility.enabled
     by_regions = pao.enabled and pao.variant != "binary"
     listed: list[tuple[bool, type[Component]]] = [
         (settings.poses.enabled, Poses),
@@ -45,7 +45,7 @@ def components_of(settings: WildGHandSettings) -> list[Component]:
         (True, Regularisers),
         (settings.dpd.enabled, Dpd),
         (settings.schedule.geometry_dropout > 0.0, GeometryDropout),
-        (evidence.enabled, FewShown),
+        (visibility.enabled, FewShown),
     ]
     return [kind() for wanted, kind in listed if wanted]
 

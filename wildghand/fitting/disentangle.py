@@ -10,7 +10,7 @@ from torch import Tensor
 
 from wildghand.dpd.dpd import draw_kept
 from wildghand.dpd.temporal import TemporalTarget
-from wildghand.fitting.fit import Batch, Component, DrawOptions, Fit, FrameTarget
+from wildghand.fitting.fit import Component, DrawOptions, Fit, FrameTarget, StepBatch
 from wildghand.fitting.judging import Prepass
 from wildghand.gaussians.training import upload
 from wildghand.model import terms
@@ -36,7 +36,7 @@ class Dropout(Component):
 class GeometryDropout(Dropout):
     """Head (i) sees the texture branch alone in some frames, an option of the authors' code."""
 
-    def draws(self, fit: Fit, batch: Batch) -> DrawOptions:
+    def draws(self, fit: Fit, batch: StepBatch) -> DrawOptions:
         """Which frames of a batch are drawn so, (B,) bool."""
         if not batch.stepping:
             return {}
@@ -70,7 +70,7 @@ class Dpd(Dropout):
             )
             self.temporal.begin(fit.model.biases)
 
-    def draws(self, fit: Fit, batch: Batch) -> DrawOptions:
+    def draws(self, fit: Fit, batch: StepBatch) -> DrawOptions:
         """Which frames of a batch keep their biases in this step, (B,) bool by side."""
         if not batch.stepping:
             return {}
@@ -82,7 +82,7 @@ class Dpd(Dropout):
         return {"kept": {side: keep[batch.part] for side, keep in kept.items()}}
 
     def loss(
-        self, fit: Fit, batch: Batch, drawing: RenderedFrames, target: FrameTarget
+        self, fit: Fit, batch: StepBatch, drawing: RenderedFrames, target: FrameTarget
     ) -> Iterable[Tensor]:
         """Hold the temporal weights, and the gains of clean frames."""
         settings, model, rows = fit.settings.dpd, fit.model, batch.mine

@@ -36,7 +36,7 @@ MAX_MASKS = 100
 
 
 @dataclass(frozen=True, eq=False)
-class Batch:
+class StepBatch:
     """The frames of one step, or frames that are looked at."""
 
     #: (B,) int64, which of the training frames; on the CPU, the same in every process.
@@ -96,18 +96,18 @@ class Component:
         """What steps move besides the model, by the name of its rate."""
         return {}
 
-    def draws(self, fit: Fit, batch: Batch) -> DrawOptions:
+    def draws(self, fit: Fit, batch: StepBatch) -> DrawOptions:
         """How the frames of a batch are drawn."""
         return {}
 
     def compare(
-        self, fit: Fit, batch: Batch, drawing: RenderedFrames, target: FrameTarget
+        self, fit: Fit, batch: StepBatch, drawing: RenderedFrames, target: FrameTarget
     ) -> FrameTarget:
         """Change the images that a batch is compared with, and how much each pixel counts."""
         return target
 
     def loss(
-        self, fit: Fit, batch: Batch, drawing: RenderedFrames, target: FrameTarget
+        self, fit: Fit, batch: StepBatch, drawing: RenderedFrames, target: FrameTarget
     ) -> Iterable[Tensor]:
         """Weighted terms of the loss of a batch, scalars, which are added up in their order."""
         return ()
@@ -182,8 +182,6 @@ class Fit(IterativeFit[WildGHandAvatar]):
         self.device = device
         self.world = world
         self.components = components
-        self.plateau_steps = settings.schedule.plateau_steps
-        self.shared_steps = settings.schedule.texture_every
         self.data = FitData(training, device)
         for component in components:
             component.prepare(self)
@@ -201,6 +199,16 @@ class Fit(IterativeFit[WildGHandAvatar]):
         )
         for component in components:
             component.begin(self)
+
+    @property
+    def plateau_steps(self) -> int:
+        """See `IterativeFit`."""
+        return self.settings.schedule.plateau_steps
+
+    @property
+    def shared_steps(self) -> int:
+        """See `IterativeFit`."""
+        return self.settings.schedule.texture_every
 
     @property
     def batch(self) -> int:
@@ -245,7 +253,7 @@ class Fit(IterativeFit[WildGHandAvatar]):
             PeerLost: another process has ended.
         """
         self.descent.set_rates(fraction)
-        loss = self.loss(Batch(batch, self.world.shard(len(batch)), stepping=True))
+        loss = self.loss(StepBatch(batch, self.world.shard(len(batch)), stepping=True))
         mean = self.world.average_(loss.detach() + self.descent.shared.value)
         known: Loss = float(mean) if self.device.type == "cpu" else mean
         if isinstance(known, float) and not math.isfinite(known):
@@ -253,7 +261,7 @@ class Fit(IterativeFit[WildGHandAvatar]):
         self.descent.take(loss, mean, self.world)
         return known
 
-    def loss(self, batch: Batch) -> Tensor:
+    def loss(self, batch: StepBatch) -> Tensor:
         """The loss of this process's part of a batch, without the terms that no frame enters."""
         drawing = self.draw(batch)
         target = self.compare(batch, drawing)
@@ -263,7 +271,7 @@ class Fit(IterativeFit[WildGHandAvatar]):
             total = total + term
         return total
 
-    def draw(self, batch: Batch, **options: Any) -> RenderedFrames:
+    def draw(self, batch: StepBatch, **options: Any) -> RenderedFrames:
         """Draw training frames with everything that is particular to them."""
         chosen: dict[str, Any] = {"dark": {}}
         for component in self.components:
@@ -279,7 +287,7 @@ class Fit(IterativeFit[WildGHandAvatar]):
             **chosen | options,
         )
 
-    def compare(self, batch: Batch, drawing: RenderedFrames) -> FrameTarget:
+    def compare(self, batch: StepBatch, drawing: RenderedFrames) -> FrameTarget:
         """The images that a drawing is compared with, and the weights of their pixels."""
         mine, data = batch.mine, self.data
         target = FrameTarget(
@@ -399,7 +407,7 @@ class Fit(IterativeFit[WildGHandAvatar]):
         # The paper's equations have no bound: 255 is the largest weight of a frame.
         least = 1e-12 if pao.variant in ("printed", "released") else 1.0
         for row in evenly(len(frames), MAX_MASKS).tolist():
-            batch = Batch(torch.tensor([row]))
+            batch = StepBatch(torch.tensor([row]))
             weights = self.compare(batch, self.draw(batch)).weights[0]
             share = 255.0 * weights / weights.max().clamp(min=least)
             masks[frames[row]] = share.byte().cpu().numpy()

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from hwp_bench.base.images import as_uint8
-from wildghand.fitting.fit import Batch, Fit
+from wildghand.fitting.fit import Fit, StepBatch
 from wildghand.fitting.weights import Pao
 from wildghand.splat.threads import denormals_flushed
 
@@ -41,7 +41,7 @@ class Glance:
 @torch.no_grad()
 def glance(fit: Fit, row: int, step: int, loss: float) -> Glance:
     """Look at one of the frames that are fitted."""
-    batch, pao, training = Batch(torch.tensor([row])), fit.part(Pao), fit.data.training
+    batch, pao, training = StepBatch(torch.tensor([row])), fit.part(Pao), fit.data.training
     # Weighing a frame moves the running medians along.
     before = {} if pao is None else pao.state_dict()
     try:

@@ -14,7 +14,7 @@ from hwp_bench.hands import pose_hand, project
 from hwp_bench.methods.contract import TrainingCapture
 from hwp_bench.methods.settings import source_path
 from wildghand.fitting.data import FitData, Judgement
-from wildghand.fitting.fit import Batch, Component, DrawOptions, Fit, FrameTarget
+from wildghand.fitting.fit import Component, DrawOptions, Fit, FrameTarget, StepBatch
 from wildghand.gaussians.training import FrameTable, TrainingFrames, upload
 from wildghand.model.frames import RenderedFrames
 from wildghand.pao.sam import PromptedHand, mask_of, open_sam
@@ -63,13 +63,13 @@ class Prepass(Component):
             torch.from_numpy(found.pixel_weights),
         )
 
-    def draws(self, fit: Fit, batch: Batch) -> DrawOptions:
+    def draws(self, fit: Fit, batch: StepBatch) -> DrawOptions:
         """The pose of frames that disagree with their mask is refined, in a batch with any."""
         move = fit.settings.prepass.frame_poses and bool(self._refine_pose[batch.rows].any())
         return {"move": move}
 
     def compare(
-        self, fit: Fit, batch: Batch, drawing: RenderedFrames, target: FrameTarget
+        self, fit: Fit, batch: StepBatch, drawing: RenderedFrames, target: FrameTarget
     ) -> FrameTarget:
         """Pixels that are covered count less, with PAO and without."""
         uncovered = fit.data.uncovered(batch.mine)
@@ -99,7 +99,7 @@ class HiddenSkin(Component):
         )
 
     def compare(
-        self, fit: Fit, batch: Batch, drawing: RenderedFrames, target: FrameTarget
+        self, fit: Fit, batch: StepBatch, drawing: RenderedFrames, target: FrameTarget
     ) -> FrameTarget:
         """Compare them with the drawing itself."""
         # So a pixel asks for nothing, in the windows of SSIM neither.

@@ -16,8 +16,7 @@ from torch import Tensor
 
 from hwp_bench.base.colors import srgb_to_linear
 from hwp_bench.hands import pose_hand
-from wildghand.evidence.count import facing_of, read_images, seen_anchors
-from wildghand.fitting.fit import Batch, Component, DrawOptions, Fit
+from wildghand.fitting.fit import Component, DrawOptions, Fit, StepBatch
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.light import (
     KnownLight,
@@ -27,6 +26,7 @@ from wildghand.light import (
     fit_light,
     obstacles_in_frames,
 )
+from wildghand.visibility.count import facing_of, read_images, seen_anchors
 
 # Weight of a frame from which it is read, if at least so many frames have it.
 _GOOD, _LEAST = 0.5, 4
@@ -69,7 +69,7 @@ class Lighting(Component):
         """
         return {} if self._table is None else self._table(rows)
 
-    def draws(self, fit: Fit, batch: Batch) -> DrawOptions:
+    def draws(self, fit: Fit, batch: StepBatch) -> DrawOptions:
         """The shadows in the frames of a batch."""
         return {"dark": self.dark(batch.mine)}
 

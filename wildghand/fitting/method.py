@@ -13,7 +13,7 @@ from hwp_bench.hands.raster import draw_faces, mix_corners
 from hwp_bench.methods.contract import Budget, Report, TrainingCapture
 from hwp_bench.methods.settings import source_path
 from wildghand.avatar.avatar import WildGHandAvatar
-from wildghand.dpd.dpd import DynamicPerturbation, Perturbation
+from wildghand.dpd.dpd import DynamicPerturbation, FramePerturbation
 from wildghand.fitting.components import make_fit
 from wildghand.gaussians.attributes import CHANNELS, Activation, RawAttributes
 from wildghand.gaussians.fit_loop import ready_device
@@ -73,7 +73,7 @@ def affordable(
     """Leave training frames out where judging all of them would take the budget away from steps.
 
     Before the first step every frame is loaded, judged, compared with the person's outline and
-    counted as evidence: some 0.06 seconds for a frame of 256 px on one core. A clip of a thousand
+    counted: some 0.06 seconds for a frame of 256 px on one core. A clip of a thousand
     frames would spend a minute on that.
     """
     share = settings.schedule.frames_per_second
@@ -114,7 +114,7 @@ def _warm_up() -> None:
         Refinement(zeros(1, 16, 3), zeros(10), zeros(1, 3)),
         zeros(1, 1),
     )
-    perturbation = Perturbation(module, module.temporal(torch.tensor([0])))
+    perturbation = FramePerturbation(module, module.temporal(torch.tensor([0])))
     gaussians, size = dress(anchors, prediction, Activation(), perturbation, torch.ones(1))
     assert size is not None
     (gaussians.means.sum() + size).backward()

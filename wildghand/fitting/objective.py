@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from hwp_bench.base.errors import UsageError
 from hwp_bench.methods.settings import source_path
 from wildghand.fitting.descent import Features
-from wildghand.fitting.fit import Batch, Component, Fit, FrameTarget
+from wildghand.fitting.fit import Component, Fit, FrameTarget, StepBatch
 from wildghand.gaussians.perceptual import FilterBankLoss, Vgg19
 from wildghand.gaussians.regularizers import attribute_roughness, off_surface, surface_laplacian
 from wildghand.gaussians.training import upload
@@ -30,7 +30,7 @@ class Reconstruction(Component):
         self._perceptual = choose_perceptual(fit.settings, fit.device)
 
     def loss(
-        self, fit: Fit, batch: Batch, drawing: RenderedFrames, target: FrameTarget
+        self, fit: Fit, batch: StepBatch, drawing: RenderedFrames, target: FrameTarget
     ) -> Iterable[Tensor]:
         """Weighted L1 and D-SSIM, the perceptual distance, and the silhouette."""
         settings, image = fit.settings.terms, drawing.image
@@ -60,7 +60,7 @@ class Regularisers(Component):
         )
 
     def loss(
-        self, fit: Fit, batch: Batch, drawing: RenderedFrames, target: FrameTarget
+        self, fit: Fit, batch: StepBatch, drawing: RenderedFrames, target: FrameTarget
     ) -> Iterable[Tensor]:
         """Biases, shadows, opacities, discs on the skin, and roughness of scales and colours."""
         settings, model = fit.settings.terms, fit.model

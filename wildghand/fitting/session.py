@@ -189,7 +189,7 @@ def _fit_in(
 
 
 def digest_of_request(request: Path, capture: Capture) -> str:
-    """What a saved state belongs to: the request, and what the capture's files held."""
+    """Digest of the request and of the capture's files, which a saved state belongs to."""
     return sha256_json([sha256_file(request / REQUEST), capture.info.to_json().get("digests")])
 
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from hwp_bench.methods.settings import source_path
-from wildghand.fitting.fit import Batch, Component, DrawOptions, Fit, FrameTarget
+from wildghand.fitting.fit import Component, DrawOptions, Fit, FrameTarget, StepBatch
 from wildghand.fitting.judging import Prepass
 from wildghand.fitting.parallel import SINGLE_PROCESS
 from wildghand.gaussians.training import FrameTable, soft_weights, upload
@@ -39,7 +39,7 @@ class MaskWeights(Component):
         self._weights = FrameTable(weigh, len(frames), size, fit.device)
 
     def compare(
-        self, fit: Fit, batch: Batch, drawing: RenderedFrames, target: FrameTarget
+        self, fit: Fit, batch: StepBatch, drawing: RenderedFrames, target: FrameTarget
     ) -> FrameTarget:
         """Weigh by the masks."""
         return replace(target, weights=self._weights(batch.mine) * target.weights)
@@ -92,7 +92,7 @@ class Pao(Component):
         """The thresholds."""
         return {"thresholds": list(self.weights.parameters())}
 
-    def draws(self, fit: Fit, batch: Batch) -> DrawOptions:
+    def draws(self, fit: Fit, batch: StepBatch) -> DrawOptions:
         """The canonical hand learns the less from a frame, the more it is perturbed."""
         return {"teach": self.shares} if self._teaches else {}
 
@@ -106,7 +106,7 @@ class Pao(Component):
         return shares + self.tolerance * (1.0 - shares)
 
     def compare(
-        self, fit: Fit, batch: Batch, drawing: RenderedFrames, target: FrameTarget
+        self, fit: Fit, batch: StepBatch, drawing: RenderedFrames, target: FrameTarget
     ) -> FrameTarget:
         """Weigh by the paper's equations.
 
@@ -137,7 +137,7 @@ class Pao(Component):
         return replace(target, weights=weights * target.weights, sizes=sizes)
 
     def _compare_as_released(
-        self, fit: Fit, batch: Batch, drawing: RenderedFrames, target: FrameTarget
+        self, fit: Fit, batch: StepBatch, drawing: RenderedFrames, target: FrameTarget
     ) -> FrameTarget:
         """Weigh by the authors' code, each process its own frames; black is what is not hand."""
         whole, visible = fit.data.whole_images(batch.mine), target.hand > 0.5
@@ -155,7 +155,7 @@ class Pao(Component):
         )
 
     def loss(
-        self, fit: Fit, batch: Batch, drawing: RenderedFrames, target: FrameTarget
+        self, fit: Fit, batch: StepBatch, drawing: RenderedFrames, target: FrameTarget
     ) -> Iterable[Tensor]:
         """Keep it from weighing everything with 0."""
         weight = fit.settings.terms.fixed.weight_reward

@@ -19,7 +19,7 @@ from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import DESCRIPTION, load_avatar
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
 from wildghand.fitting.session import Watch, fit_capture
-from wildghand.from_video.run import Job, JobRecord, VideoFit, run_stages, with_quick
+from wildghand.from_video.run import JobRecord, VideoFit, VideoJob, run_stages, with_quick
 from wildghand.from_video.stages import STAGES
 from wildghand.model.settings import read_settings
 
@@ -31,7 +31,7 @@ class MadeAvatar:
     #: The avatar; `avatar.folder` is where it lies.
     avatar: WildGHandAvatar
     #: Its files.
-    job: Job
+    job: VideoJob
     #: Seconds of every stage, those of earlier runs included.
     record: JobRecord
     #: Names of the stages that earlier runs had done.
@@ -108,7 +108,7 @@ def make_avatar(
     """
     options = options or VideoFit()
     folder = default_folder(Path(video)) if out is None else Path(out)
-    job = Job(Path(video), folder, options, world, watch)
+    job = VideoJob(Path(video), folder, options, world, watch)
     chosen = read_settings(options.method_settings())
     world.shard(chosen.schedule.batch)
     if world.is_main:
@@ -122,7 +122,7 @@ def make_avatar(
     return MadeAvatar(load_avatar(folder, hand=options.hand_model), job, record, tuple(kept))
 
 
-def _check_folder(job: Job, *, overwrite: bool) -> None:
+def _check_folder(job: VideoJob, *, overwrite: bool) -> None:
     """Refuse a folder that holds something else than this job."""
     folder = job.folder
     if folder.exists() and not folder.is_dir():

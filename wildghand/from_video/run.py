@@ -31,7 +31,7 @@ from hwp_bench.base.files import read_json, write_json
 from hwp_bench.base.records import Seconds, merged, parse_record
 from hwp_bench.capture.schema import METADATA, check_id
 from hwp_bench.importers.shared.output import CHOICES, check_choices
-from hwp_bench.importers.video import FitSettings
+from hwp_bench.importers.video import SolveSettings
 from wildghand.avatar.files import DESCRIPTION
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
 from wildghand.fitting.session import Watch
@@ -65,7 +65,7 @@ class VideoFit:
     #: Fit every frame. False leaves the last fifth out, for a score.
     all_frames: bool = True
     #: Numbers of the import's fit.
-    importer: FitSettings = field(default_factory=FitSettings)
+    importer: SolveSettings = field(default_factory=SolveSettings)
     #: Optimizer steps, or None for the settings' number.
     steps: int | None = None
     #: Most seconds of optimizing, or None.
@@ -99,7 +99,7 @@ def with_quick(settings: Mapping[str, Any], *, quick: bool) -> dict[str, Any]:
     return merged(QUICK, nested(settings)) if quick else dict(settings)
 
 
-class Job:
+class VideoJob:
     """One video, the folder of its avatar, the choices, and where everything lies.
 
     `world` are the processes that fit together; `watch` is who is shown the fit while it runs.
@@ -158,26 +158,26 @@ class Stage(ABC):
     makes = ""
 
     @abstractmethod
-    def facts(self, job: Job) -> dict[str, str]:
+    def facts(self, job: VideoJob) -> dict[str, str]:
         """What its result depends on: digests and settings, by a name that a person understands.
 
         The stages before it have ended when this is called.
         """
 
-    def result(self, job: Job) -> Path:
+    def result(self, job: VideoJob) -> Path:
         """The file or folder that says that its result is there; else the job's, by its name."""
         place: Path = getattr(job, self.makes)
         return place
 
     @abstractmethod
-    def run(self, job: Job) -> None:
+    def run(self, job: VideoJob) -> None:
         """Make the result; where the last run with the same facts was stopped, it may go on."""
 
     @abstractmethod
-    def expected(self, job: Job) -> float:
+    def expected(self, job: VideoJob) -> float:
         """Seconds that it should take on two cores; stages before it may not have been run."""
 
-    def discard(self, job: Job) -> None:  # noqa: B027
+    def discard(self, job: VideoJob) -> None:  # noqa: B027
         """Remove what a stopped run left, because its facts are others; most leave nothing."""
 
 
@@ -228,7 +228,7 @@ def write_record(path: Path, record: JobRecord) -> None:
     write_json(path, asdict(record))
 
 
-def run_stages(job: Job, stages: Sequence[Stage]) -> tuple[JobRecord, list[str]]:
+def run_stages(job: VideoJob, stages: Sequence[Stage]) -> tuple[JobRecord, list[str]]:
     """Run the stages that are not done; every process of the job's world calls this."""
     if not job.world.is_main:
         for stage in stages:
@@ -274,7 +274,7 @@ def run_stages(job: Job, stages: Sequence[Stage]) -> tuple[JobRecord, list[str]]
 
 
 def _reason_to_run(
-    job: Job, stage: Stage, last: StageRecord | None, facts: Mapping[str, str]
+    job: VideoJob, stage: Stage, last: StageRecord | None, facts: Mapping[str, str]
 ) -> str | None:
     """Say why a stage is run again; nothing the first time, None where it is done."""
     if last is None:

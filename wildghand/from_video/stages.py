@@ -30,7 +30,7 @@ from hwp_bench.tracking.track_video import NoHandSeen
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import DESCRIPTION, MODEL, WEIGHTS, load_avatar
 from wildghand.fitting.session import fit_capture, unfinished
-from wildghand.from_video.run import Job, Stage
+from wildghand.from_video.run import Stage, VideoJob
 from wildghand.model.settings import read_settings
 from wildghand.page import write_page
 
@@ -105,13 +105,13 @@ class _Picture(Stage):
     #: Everything that the picture depends on, besides the avatar.
     look: str
 
-    def facts(self, job: Job) -> dict[str, str]:
+    def facts(self, job: VideoJob) -> dict[str, str]:
         return {"avatar": avatar_digest(job.folder), f"look of the {self.name}": self.look}
 
-    def run(self, job: Job) -> None:
+    def run(self, job: VideoJob) -> None:
         self.show(job, load_avatar(job.folder, hand=job.options.hand_model))
 
-    def show(self, job: Job, avatar: WildGHandAvatar) -> None:
+    def show(self, job: VideoJob, avatar: WildGHandAvatar) -> None:
         """Write the picture."""
         raise NotImplementedError
 
@@ -122,12 +122,12 @@ class DrawTurntable(_Picture):
     name, title, makes = "turntable", "Drawing the turntable", "turntable"
     look = str((2, SIZE, FRAMES, FPS, BACKGROUND))
 
-    def show(self, job: Job, avatar: WildGHandAvatar) -> None:
+    def show(self, job: VideoJob, avatar: WildGHandAvatar) -> None:
         table = Turntable(avatar, SIZE)
         angles = track([360.0 * frame / FRAMES for frame in range(FRAMES)], "drawing the turntable")
         write_movie(job.turntable, (table.view(angle) for angle in angles), FPS)
 
-    def expected(self, job: Job) -> float:
+    def expected(self, job: VideoJob) -> float:
         return 4.0 + 0.1 * FRAMES
 
 
@@ -137,11 +137,11 @@ class DrawSheet(_Picture):
     name, title, makes = "sheet", "Drawing the contact sheet", "sheet"
     look = str((1, COLUMNS, EDGE))
 
-    def show(self, job: Job, avatar: WildGHandAvatar) -> None:
+    def show(self, job: VideoJob, avatar: WildGHandAvatar) -> None:
         drawn = avatar_sheet(avatar, open_capture(job.capture), job.folder / WEIGHTS)
         write_image(job.sheet, drawn)
 
-    def expected(self, job: Job) -> float:
+    def expected(self, job: VideoJob) -> float:
         return 6.0
 
 
@@ -151,10 +151,10 @@ class WritePage(_Picture):
     name, title, makes = "page", "Writing the page", "page"
     look = "1"
 
-    def show(self, job: Job, avatar: WildGHandAvatar) -> None:
+    def show(self, job: VideoJob, avatar: WildGHandAvatar) -> None:
         write_page(avatar, job.page, capture=open_capture(job.capture), overwrite=True)
 
-    def expected(self, job: Job) -> float:
+    def expected(self, job: VideoJob) -> float:
         return 15.0
 
 
@@ -162,17 +162,17 @@ class WritePage(_Picture):
 FEWEST = 12
 
 
-def _frame_count(job: Job) -> int:
+def _frame_count(job: VideoJob) -> int:
     """Number of frames as the container states it; 600 where it states none."""
     return probe(job.video).stated_frames or 600
 
 
-class Track(Stage):
+class TrackStage(Stage):
     """The landmarks of the hands in the video; nothing where a person gives them."""
 
     name, title, makes = "track", "Tracking the hand", "landmarks"
 
-    def facts(self, job: Job) -> dict[str, str]:
+    def facts(self, job: VideoJob) -> dict[str, str]:
         given, model = job.options.landmarks, job.options.tracker
         if given is not None:
             check_is_file(given, field="--landmarks")
@@ -180,7 +180,7 @@ class Track(Stage):
         tracker = "shipped" if model is None else str(model)
         return {"video": sha256_of(job.video), "tracker": tracker}
 
-    def run(self, job: Job) -> None:
+    def run(self, job: VideoJob) -> None:
         if job.options.landmarks is not None:
             return
         try:
@@ -199,7 +199,7 @@ class Track(Stage):
                 "0.3` accepts less; give what it writes with --landmarks.",
             ) from error
 
-    def expected(self, job: Job) -> float:
+    def expected(self, job: VideoJob) -> float:
         # A frame of 720p takes 24 ms.
         return 0.0 if job.options.landmarks else 1.0 + 0.024 * _frame_count(job)
 
@@ -209,7 +209,7 @@ class Import(Stage):
 
     name, title, makes = "import", "Importing the hand", "metadata"
 
-    def facts(self, job: Job) -> dict[str, str]:
+    def facts(self, job: VideoJob) -> dict[str, str]:
         return {
             "video": sha256_of(job.video),
             "landmarks": sha256_of(job.landmarks),
@@ -220,10 +220,10 @@ class Import(Stage):
             "version of the importer": str(IMPORTER_VERSION),
         }
 
-    def run(self, job: Job) -> None:
+    def run(self, job: VideoJob) -> None:
         import_video(job.video, job.landmarks, job.capture, import_options(job))
 
-    def expected(self, job: Job) -> float:
+    def expected(self, job: VideoJob) -> float:
         # A frame takes 0.3 s, one that is decoded only 5 ms.
         count = _frame_count(job)
         return 0.3 * (count / stride(count, job.options.most_frames)) + 0.005 * count
@@ -234,7 +234,7 @@ def stride(count: int, most: int) -> int:
     return max(1, round(count / most))
 
 
-def import_options(job: Job) -> VideoImport:
+def import_options(job: VideoJob) -> VideoImport:
     """Choose the frames and hands of an import; refuse a video that shows too few."""
     choices = VideoImport(
         side=job.options.side,
@@ -272,12 +272,12 @@ def import_options(job: Job) -> VideoImport:
     return replace(choices, frames=frames)
 
 
-class Fit(Stage):
+class FitStage(Stage):
     """The avatar, fitted to the capture."""
 
     name, title, makes, together = "fit", "Fitting the avatar", "fit", True
 
-    def facts(self, job: Job) -> dict[str, str]:
+    def facts(self, job: VideoJob) -> dict[str, str]:
         options = job.options
         return {
             "capture": open_capture(job.capture).digest,
@@ -288,7 +288,7 @@ class Fit(Stage):
             "choice of frames": "all" if options.all_frames else "split",
         }
 
-    def run(self, job: Job) -> None:
+    def run(self, job: VideoJob) -> None:
         options = job.options
         fit_capture(
             job.capture,
@@ -302,10 +302,10 @@ class Fit(Stage):
             watch=job.watch,
         )
 
-    def discard(self, job: Job) -> None:
+    def discard(self, job: VideoJob) -> None:
         shutil.rmtree(unfinished(job.fitted), ignore_errors=True)
 
-    def expected(self, job: Job) -> float:
+    def expected(self, job: VideoJob) -> float:
         settings = read_settings(job.options.method_settings())
         steps = job.options.steps or settings.schedule.steps
         # A step of 12,337 Gaussians takes 50 ms, what goes before the first 25 s.
@@ -319,10 +319,10 @@ class Place(Stage):
 
     name, title, makes = "place", "Placing the avatar", "avatar"
 
-    def facts(self, job: Job) -> dict[str, str]:
+    def facts(self, job: VideoJob) -> dict[str, str]:
         return {"avatar": avatar_digest(job.fitted)}
 
-    def run(self, job: Job) -> None:
+    def run(self, job: VideoJob) -> None:
         try:
             (job.folder / DESCRIPTION).unlink(missing_ok=True)
             shutil.rmtree(job.folder / WEIGHTS, ignore_errors=True)
@@ -335,15 +335,15 @@ class Place(Stage):
         except OSError as error:
             raise HwpError(f"cannot be written ({reason_of(error)})", where=job.folder) from error
 
-    def expected(self, job: Job) -> float:
+    def expected(self, job: VideoJob) -> float:
         return 0.1
 
 
 #: The stages of a job, in order. Another one is another class here.
 STAGES: tuple[Stage, ...] = (
-    Track(),
+    TrackStage(),
     Import(),
-    Fit(),
+    FitStage(),
     Place(),
     DrawTurntable(),
     DrawSheet(),

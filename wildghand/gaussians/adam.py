@@ -45,11 +45,14 @@ class ClippedAdam(torch.optim.Adam):
             for parameter in group["params"]:
                 parameter.grad = None
 
-    def take_step(self, loss: Tensor) -> None:
+    def take_step(self, loss: Tensor) -> Tensor:
         """Move everything that has a gradient; nothing changes where one or the loss is not finite.
 
         Nobody waits to learn whether it is: torch's fused kernels read that where it lies, as for a
         `GradScaler`, and skip the step.
+
+        Returns:
+            1 where nothing has changed, else 0, a scalar on the device.
         """
         gradients = []
         for group in self.param_groups:
@@ -60,11 +63,39 @@ class ClippedAdam(torch.optim.Adam):
         finite = loss.detach().isfinite()
         if gradients:
             finite = finite & torch.stack(torch._foreach_norm(gradients, math.inf)).isfinite().all()
-        self.found_inf = (~finite).float()
+        stopped = (~finite).float()
         if self.limit > 0.0:
             clipped = [group["params"] for group in self.param_groups if group.get("clipped", True)]
             torch.nn.utils.clip_grad_norm_([p for some in clipped for p in some], self.limit)
-        self.step()
+        with torch.no_grad():
+            for group in self.param_groups:
+                self._move(group, stopped)
+        return stopped
+
+    def _move(self, group: dict[str, Any], stopped: Tensor) -> None:
+        """Take one group's step, as `step` does without torch's compiler; none where stopped is 1.
+
+        The first call of `step` imports that compiler, for seconds.
+        """
+        moved: tuple[list[Tensor], ...] = ([], [], [], [], [], [])
+        self._init_group(group, *moved)
+        parameters, gradients, means, squares, _, steps = moved
+        if not parameters:
+            return
+        torch._foreach_add_(steps, 1)
+        torch._fused_adam_(
+            *(parameters, gradients, means, squares, [], steps),
+            lr=group["lr"],
+            beta1=group["betas"][0],
+            beta2=group["betas"][1],
+            weight_decay=group["weight_decay"],
+            eps=group["eps"],
+            amsgrad=False,
+            maximize=False,
+            grad_scale=None,
+            found_inf=stopped,
+        )
+        torch._foreach_sub_(steps, [stopped] * len(steps))
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Go on from a saved state, also one of `torch.optim.Adam` over the same groups."""

@@ -61,7 +61,7 @@ class Images(NamedTuple):
     content: np.ndarray  # (B, 4) int64, see `find_content`
 
 
-class Constants(NamedTuple):
+class LossConstants(NamedTuple):
     """Constants of the loss."""
 
     window: np.ndarray  # (11,) float32, symmetric
@@ -289,7 +289,7 @@ class PhotometricCpu(torch.autograd.Function):
             for tensor in (prediction, target, weights)
         )
         window = _window().astype(np.float32)
-        constants = Constants(window, *map(np.float32, (dssim_weight, C1, C2, x.size)))
+        constants = LossConstants(window, *map(np.float32, (dssim_weight, C1, C2, x.size)))
         images = Images(x.reshape(rows), y.reshape(rows), w, np.empty((count, 4), np.int64))
         made = Made(
             np.empty(w.shape, np.float32),

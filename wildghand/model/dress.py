@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from wildghand.dpd.dpd import Perturbation
+from wildghand.dpd.dpd import FramePerturbation
 from wildghand.dpd.temporal import scale_gradients
 from wildghand.gaussians.attributes import CHANNELS, Activation
 from wildghand.gaussians.quaternions import quat_multiply, quat_rotate
@@ -32,7 +32,7 @@ def dress_cpu(
     anchors: AnchorPoses,
     prediction: NetworkOutput,
     activation: Activation,
-    perturbation: Perturbation | None,
+    perturbation: FramePerturbation | None,
     shares: Tensor | None,
 ) -> tuple[tuple[Tensor, ...], Tensor | None]:
     """See `wildghand.model.dress.dress`."""
@@ -180,7 +180,7 @@ def dress(
     anchors: AnchorPoses,
     prediction: NetworkOutput,
     activation: Activation,
-    perturbation: Perturbation | None = None,
+    perturbation: FramePerturbation | None = None,
     shares: Tensor | None = None,
 ) -> tuple[Gaussians, Tensor | None]:
     """Bring the Gaussians of one hand into the world.

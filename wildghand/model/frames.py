@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from wildghand.evidence.count import facing_of
 from wildghand.gaussians.attributes import RawAttributes
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import AnchorPoses
@@ -16,6 +15,7 @@ from wildghand.light import KnownLight
 from wildghand.model.dress import Gaussians
 from wildghand.network import NetworkOutput
 from wildghand.splat import rasterize
+from wildghand.visibility.count import facing_of
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,8 +1,8 @@
 """The model that is fitted: network, perturbation biases, frame-wise corrections, and drawing.
 
 A hand in free poses is drawn in two stages. What network and light say comes first and takes
-longest (`predict_hand`). What evidence, changes of colours, shadows and the refined pose make of it
-comes second (`dressed`), so that it can be tried in several ways.
+longest (`predict_hand`). What visibility, changes of colours, shadows and the refined pose make of
+it comes second (`dressed`), so that it can be tried in several ways.
 """
 
 from __future__ import annotations
@@ -15,9 +15,8 @@ import torch
 from torch import Tensor, nn
 
 from hwp_bench.hands import HandTemplate, sample_surface
-from wildghand.dpd.dpd import DynamicPerturbation, Perturbation, Temporal, bone_features
+from wildghand.dpd.dpd import DynamicPerturbation, FramePerturbation, Temporal, bone_features
 from wildghand.dpd.temporal import scale_refinement
-from wildghand.evidence import ColorChanges, Evidence
 from wildghand.gaussians.attributes import RawAttributes
 from wildghand.gaussians.found import Found
 from wildghand.gaussians.quaternions import quat_third_axis
@@ -38,6 +37,7 @@ from wildghand.network import (
 )
 from wildghand.poses import ClipPoses
 from wildghand.subject import SubjectShape
+from wildghand.visibility import ColorChanges, Visibility
 
 #: What a model may keep, the attribute that draws by it, and whether it says something of each
 #: Gaussian. Another `Found` needs one line here.
@@ -45,7 +45,7 @@ FOUND: tuple[tuple[type[Found], str, bool], ...] = (
     (KnownLight, "light", False),
     (CastLight, "shadows", False),
     (ClipPoses, "clip_poses", False),
-    (Evidence, "evidence", True),
+    (Visibility, "visibility", True),
     (ColorChanges, "color_changes", True),
 )
 
@@ -78,7 +78,7 @@ class WildGHandModel(nn.Module):
     Attributes:
         log_gains: (R, 3) log of the gain on the sRGB image of each frame.
         light: by which unknown normals are drawn in free poses; None: as the network says.
-        evidence: by which free poses are drawn; None: as they were learnt.
+        visibility: by which free poses are drawn; None: as they were learnt.
         clip_poses: what is believed of the poses that the clip gives; None: what it gives.
         color_changes: of places that few frames have shown, in free poses; None: none.
         shadows: the hands in the light that casts shadows; None: the network alone says how bright
@@ -103,7 +103,7 @@ class WildGHandModel(nn.Module):
         self.shadows: HandShadows | None = None
         self._template = template
         self.light: KnownLight | None = None
-        self.evidence: Evidence | None = None
+        self.visibility: Visibility | None = None
         self.color_changes: ColorChanges | None = None
         self.clip_poses: ClipPoses | None = None
         self._walls: dict[str, WristWall] = {}
@@ -129,7 +129,7 @@ class WildGHandModel(nn.Module):
         held: Any = found.to(device)
         if isinstance(held, CastLight):
             held = HandShadows(self.rigs, held)
-        if isinstance(held, Evidence):
+        if isinstance(held, Visibility):
             walls = {side: WristWall.of(rig) for side, rig in self.rigs.items()}
             self._walls = {side: wall for side, wall in walls.items() if wall is not None}
         for kind, attribute, _ in FOUND:
@@ -246,7 +246,7 @@ class WildGHandModel(nn.Module):
 
     def perturbation_in(
         self, side: str, temporal: Temporal, anchors: AnchorPoses, kept: Tensor | None
-    ) -> Perturbation:
+    ) -> FramePerturbation:
         """The perturbation of one hand in B frames, with its field where that can be seen."""
         module, field = self.biases_of(side), None
         # Off the CPU the question would wait for the device.
@@ -254,7 +254,7 @@ class WildGHandModel(nn.Module):
         if module.field is not None and not unseen:
             normals = quat_third_axis(anchors.orientations)
             field = module.field(temporal.z, self.get_buffer(f"bones_{side}"), normals)
-        return Perturbation(module, temporal, kept, field)
+        return FramePerturbation(module, temporal, kept, field)
 
     def draw(
         self,
@@ -268,7 +268,7 @@ class WildGHandModel(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Draw hands in any pose, free of what perturbed the training frames.
 
-        With `evidence`, a wall closes the open end of the wrist, which no frame looks into.
+        With `visibility`, a wall closes the open end of the wrist, which no frame looks into.
 
         Args:
             hands: pose (B, 16, 3), betas (10,), transl (B, 3) by side.
@@ -303,13 +303,13 @@ class WildGHandModel(nn.Module):
         return rasterize_hands(parts, viewmats, Ks, width, height)
 
     def wall(self, side: str) -> WristWall | None:
-        """What closes the wrist of one hand; None without evidence, or where it stays open."""
-        if self.evidence is None or side in self.evidence.open_wrists:
+        """What closes the wrist of one hand; None without visibility, or where it stays open."""
+        if self.visibility is None or side in self.visibility.open_wrists:
             return None
         return self._walls.get(side)
 
     def walls(self, found: Mapping[str, tuple[Gaussians, Hand]]) -> list[Gaussians]:
-        """Close the wrists of hands; none while there is no evidence."""
+        """Close the wrists of hands; none while there is no visibility."""
         several = ((self.wall(side), *each) for side, each in found.items())
         return [wall.close(made, *hand) for wall, made, hand in several if wall is not None]
 
@@ -389,9 +389,9 @@ class WildGHandModel(nn.Module):
         """
         rig, anchors, prediction = self.rigs[side], predicted.anchors, predicted.prediction
         pose, betas, transl = predicted.hand
-        if self.evidence is not None:
+        if self.visibility is not None:
             bias = self.network.activation.log_scale_bias
-            settled = self.evidence.settle(side, prediction.raw, rig.spacing, bias)
+            settled = self.visibility.settle(side, prediction.raw, rig.spacing, bias)
             prediction = replace(prediction, raw=settled)
         if self.color_changes is not None:
             prediction = replace(prediction, raw=self.color_changes.color(side, prediction.raw))

@@ -16,19 +16,19 @@ from hwp_bench.base.errors import BadMethod, nearest
 from hwp_bench.base.records import flattened, merged
 from hwp_bench.methods.settings import check_source, choice, number, settings_from
 from wildghand.dpd.dpd import DpdSettings
-from wildghand.evidence import EvidenceSettings
 from wildghand.model.terms import TermSettings
 from wildghand.network.settings import SIZES, NetworkSettings, network_settings
 from wildghand.pao.pao import PaoSettings
 from wildghand.prepass import PrepassSettings
+from wildghand.visibility import VisibilitySettings
 
 #: Where messages place a wrong setting.
 WHERE = "wildghand"
 
 
 @dataclass(frozen=True)
-class Switch:
-    """An addition whose numbers are constants beside their use."""
+class SwitchSettings:
+    """An addition whose numbers are constants next to their use."""
 
     #: Whether it is a part of the fit.
     enabled: bool = True
@@ -113,15 +113,15 @@ class WildGHandSettings:
     #: Component: template offsets (head iii) and refinement of the hand parameters (head iv).
     heads: bool = True
     #: Addition: given poses are corrected by what the clip's poses have in common.
-    poses: Switch = field(default_factory=Switch)
+    poses: SwitchSettings = field(default_factory=SwitchSettings)
     #: Addition: the template is bent to the person before the fit.
-    subject: Switch = field(default_factory=Switch)
+    subject: SwitchSettings = field(default_factory=SwitchSettings)
     #: Addition: a light for normals that no frame has shown.
-    light: Switch = field(default_factory=Switch)
+    light: SwitchSettings = field(default_factory=SwitchSettings)
     #: Addition: shadows that the hands cast on themselves and on each other.
-    shadows: Switch = field(default_factory=Switch)
+    shadows: SwitchSettings = field(default_factory=SwitchSettings)
     #: Addition: Gaussians that few frames show are discs on the skin.
-    evidence: EvidenceSettings = field(default_factory=EvidenceSettings)
+    visibility: VisibilitySettings = field(default_factory=VisibilitySettings)
     #: Addition: the judge of the frames. It says where the temporal weights start, which pixels are
     #: covered, and which poses need refining.
     prepass: PrepassSettings = field(default_factory=PrepassSettings)
@@ -147,7 +147,7 @@ _BARE: Mapping[str, Any] = MappingProxyType(
         "terms": {"surface": 0.0, "leave_hidden": False},
         **{
             name: {"enabled": False}
-            for name in ("poses", "subject", "light", "shadows", "evidence", "prepass")
+            for name in ("poses", "subject", "light", "shadows", "visibility", "prepass")
         },
     }
 )

@@ -26,9 +26,9 @@ from wildghand.avatar import PosedGaussians, WildGHandAvatar, load_avatar
 from wildghand.avatar.avatar import InlinePicture, splat
 from wildghand.avatar.render import shown_sides
 from wildghand.avatar.studio import REST
-from wildghand.evidence.count import seen_anchors
 from wildghand.gaussians.quaternions import matrix_to_quat
 from wildghand.page.bake import BakedHand, FrameBiases, PoseBasis, bake_biases, bake_hand
+from wildghand.visibility.count import seen_anchors
 
 if TYPE_CHECKING:
     from markupsafe import Markup
@@ -422,12 +422,12 @@ def _seen(avatar: WildGHandAvatar, side: str, count: int) -> str | None:
     """(N,) uint8: how far the clip has shown each Gaussian; None where the fit did not count.
 
     255 is the share of the frames at which the fit keeps half of an offset from the skin
-    (`wildghand.evidence`), or more of them.
+    (`wildghand.visibility`), or more of them.
     """
-    evidence = avatar.model.evidence
-    if evidence is None:
+    visibility = avatar.model.visibility
+    if visibility is None:
         return None
-    kept = evidence.offsets[side].double().cpu().numpy()
+    kept = visibility.offsets[side].double().cpu().numpy()
     # Of frames f and their half h a fit keeps k = f / (f + h); f / h is k / (1 - k).
     share = np.clip(kept / np.maximum(1.0 - kept, 1e-9), 0.0, 1.0)
     return _pack(_with_wall(np.rint(share * 255.0), count))

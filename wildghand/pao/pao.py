@@ -132,7 +132,7 @@ DRAWN_FROM = 0.95
 _CHANNELS = 3.0
 
 
-class Constants(NamedTuple):
+class PaoConstants(NamedTuple):
     """Factors, and thresholds at the start."""
 
     #: Of every region's weight.
@@ -146,12 +146,12 @@ class Constants(NamedTuple):
 
 
 #: The paper prints thresholds; alpha and beta are the authors' code's.
-_PUBLISHED = Constants(100.0, 1000.0, 1.0, 0.3)
+_PUBLISHED = PaoConstants(100.0, 1000.0, 1.0, 0.3)
 #: By variant. `scaled` counts errors in ordinary ones. With beta = 1000 an omega of 0.005, which is
 #: noise, would cost a frame five sixths of its weight.
-CONSTANTS: Mapping[str, Constants] = MappingProxyType(
+CONSTANTS: Mapping[str, PaoConstants] = MappingProxyType(
     {
-        "scaled": Constants(1.0, 100.0, 3.0, 0.0),
+        "scaled": PaoConstants(1.0, 100.0, 3.0, 0.0),
         "printed": _PUBLISHED,
         # Their temporal factor is 1 for every omega: it is rounded to an integer.
         "released": _PUBLISHED._replace(beta=0.0),

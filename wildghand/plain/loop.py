@@ -33,13 +33,19 @@ class IterativeFit(Generic[Result]):
 
     Attributes:
         device: where its tensors live.
-        plateau_steps: window of the plateau, at which it stops early; 0: it never does.
-        shared_steps: steps that share work which one of them does.
     """
 
     device: torch.device
-    plateau_steps: int = 0
-    shared_steps: int = 1
+
+    @property
+    def plateau_steps(self) -> int:
+        """Window of the plateau, at which it stops early; 0: it never does."""
+        return 0
+
+    @property
+    def shared_steps(self) -> int:
+        """Steps that share work which one of them does."""
+        return 1
 
     def count_steps(self, budget: Budget) -> int:
         """The steps of the fit, where seconds do not end it before."""
@@ -189,7 +195,7 @@ class Watchers:
 
 
 def _mean_of_window(losses: list[Loss], loss: Loss, window: int) -> float | None:
-    """Add a loss to those of a window; their mean where that is full, which begins anew then."""
+    """Add a loss to those of a window; their mean where that is full; it is emptied then."""
     if not window:
         return None
     losses.append(loss)

@@ -8,7 +8,7 @@ from wildghand.gaussians.training import TrainingClip
 
 
 class PoseCorrections:
-    """What is added to the given poses of R training frames; zeros at first.
+    """Changes that are added to the given poses of R training frames; zeros at first.
 
     Attributes:
         poses: by side, (R, 16, 3) rad, added to the axis-angle vectors.

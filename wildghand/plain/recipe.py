@@ -89,7 +89,7 @@ Settings = TypeVar("Settings", bound=LoopSettings)
 
 
 @dataclass(frozen=True, eq=False)
-class Material:
+class FitInputs:
     """The material of a fit."""
 
     #: What the method may see of the capture.
@@ -139,7 +139,7 @@ class Recipe(IterativeFit[Avatar], Generic[Settings]):
         settings: how.
     """
 
-    def __init__(self, material: Material, settings: Settings) -> None:
+    def __init__(self, material: FitInputs, settings: Settings) -> None:
         self.material = material
         self.settings = settings
         self.device = material.device
@@ -216,8 +216,7 @@ class Recipe(IterativeFit[Avatar], Generic[Settings]):
             return value
         optimizer.clear()
         loss.backward()
-        optimizer.take_step(loss)
-        if optimizer.found_inf:  # a gradient is not finite: the fit has diverged
+        if optimizer.take_step(loss):  # a gradient is not finite: the fit has diverged
             return math.nan
         self.move_back(drawn)
         self._steps += 1
@@ -284,7 +283,7 @@ class PlainRecipe(Recipe[PlainSettings]):
         clip: hands and cameras of the training frames.
     """
 
-    def __init__(self, material: Material, settings: PlainSettings) -> None:
+    def __init__(self, material: FitInputs, settings: PlainSettings) -> None:
         super().__init__(material, settings)
         self.model = self.start()
         self.clip = TrainingClip(
@@ -381,5 +380,5 @@ class RecipeMethod:
             BadInput: no training frame can be used.
             DidNotConverge: the fit diverged at once.
         """
-        material = Material(training, load_frames(training), self.seed, self.device)
+        material = FitInputs(training, load_frames(training), self.seed, self.device)
         return run_fit(self.recipe_type(material, self.settings), budget, report)

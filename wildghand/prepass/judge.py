@@ -36,7 +36,7 @@ from wildghand.prepass.intensity import (
 )
 from wildghand.prepass.measurements import (
     LEAST_PIXELS,
-    Frame,
+    DrawnFrame,
     FrameMeasurements,
     PrepassInput,
     measure_frame,
@@ -247,19 +247,19 @@ def _judge(
     return replace(judged, pixel_weights=weights)
 
 
-def _draw(given: PrepassInput, surfaces: HandSurfaces) -> dict[int, Frame]:
+def _draw(given: PrepassInput, surfaces: HandSurfaces) -> dict[int, DrawnFrame]:
     """Draw the hands of frames that can be measured, by row."""
     rows = np.flatnonzero(_measurable(given))
     drawn = surfaces.footprints(
         given.hands, given.cameras.Ks, given.cameras.viewmats, given.indices[rows], given.size
     )
     return {
-        row: Frame(footprint, given.images[row], given.masks[row])
+        row: DrawnFrame(footprint, given.images[row], given.masks[row])
         for row, footprint in zip(rows.tolist(), drawn, strict=True)
     }
 
 
-def _readable(drawn: Mapping[int, Frame]) -> dict[int, Frame]:
+def _readable(drawn: Mapping[int, DrawnFrame]) -> dict[int, DrawnFrame]:
     """The frames whose hands are in the image, where the mask has them, and can be read."""
     return {row: one for row, one in drawn.items() if one.inner.sum() >= LEAST_PIXELS}
 
@@ -283,7 +283,7 @@ def _is_flat(image: np.ndarray) -> bool:
     return int(pixels.max()) < LOWEST or bool((pixels == pixels[0]).all())
 
 
-def _intensity_samples(frames: Sequence[Frame], quota: int) -> IntensitySamples:
+def _intensity_samples(frames: Sequence[DrawnFrame], quota: int) -> IntensitySamples:
     """The pixels from which the intensity model is fitted, at most so many of each frame."""
     table = log_light_table()
     cells, light, normals = [], [], []

@@ -261,7 +261,7 @@ class FrameMeasurements:
 
 
 @dataclass(eq=False)
-class Frame:
+class DrawnFrame:
     """A frame in which hands are drawn where its parameters place them."""
 
     #: Of the hands: P pixels.
@@ -305,7 +305,7 @@ class Frame:
         return border_width(self.image, self.masked)
 
 
-def shown_cells(frames: Iterable[Frame], cell_count: int) -> np.ndarray:
+def shown_cells(frames: Iterable[DrawnFrame], cell_count: int) -> np.ndarray:
     """(C,) bool: the cells that masks have in most frames in which the silhouette has them.
 
     A cell that no mask shows (the wrist inside a sleeve) does not count as hidden.
@@ -319,7 +319,7 @@ def shown_cells(frames: Iterable[Frame], cell_count: int) -> np.ndarray:
     return np.asarray(2 * shown > drawn)
 
 
-def measure_frame(model: IntensityModel, frame: Frame, shown: np.ndarray) -> FrameMeasurements:
+def measure_frame(model: IntensityModel, frame: DrawnFrame, shown: np.ndarray) -> FrameMeasurements:
     """Compare a frame with the intensity model; `shown` is that of `shown_cells`."""
     table, footprint, inner = log_light_table(), frame.footprint, frame.inner
     light = table[frame.values]

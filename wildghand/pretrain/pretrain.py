@@ -172,7 +172,11 @@ class JointFit(IterativeFit[tuple[dict[str, Tensor], int]]):
                 _share(self.fits[0].model.network, fit.model.network)
             self.fits.append(fit)
         _join_optimizers(self.fits)
-        self.plateau_steps = schedule.plateau_steps
+
+    @property
+    def plateau_steps(self) -> int:
+        """See `IterativeFit`."""
+        return self.settings.schedule.plateau_steps
 
     def count_steps(self, budget: Budget) -> int:
         """Steps over all captures."""

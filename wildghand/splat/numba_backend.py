@@ -92,7 +92,7 @@ class Lists:
 
 
 @dataclass
-class Call:
+class RasterCall:
     """The data that one call of `rasterize` keeps for its backward pass; it is not shared.
 
     The forward steps fill in their results, in this order.
@@ -140,7 +140,7 @@ def _draw(scene: FlatScene) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]
     cameras = np.empty((scene.images, CAMERA))
     given = (m.detach().double().contiguous().numpy() for m in (scene.viewmats, scene.Ks))
     prepare_cameras(*given, options.width, options.height, cameras)
-    call = Call(options, cameras)
+    call = RasterCall(options, cameras)
     ellipsoids = (scene.means.contiguous(), scene.quats.contiguous(), scene.scales.contiguous())
     looks = (scene.opacities.contiguous(), scene.colors.contiguous())
     means2d, shapes, depths, compensations = Project.apply(
@@ -186,7 +186,7 @@ class Project(torch.autograd.Function):
         viewmats: torch.Tensor,
         opacities: torch.Tensor,
         colors: torch.Tensor,
-        call: Call,
+        call: RasterCall,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
         """Culls and projects flat contiguous float32 tensors; `call` gets `projected`."""
         ctx.set_materialize_grads(False)
@@ -218,7 +218,7 @@ class Project(torch.autograd.Function):
     def backward(ctx: Any, *upstream: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
         """Gradients of `forward`'s arguments."""
         _refuse_second_order()
-        call: Call = ctx.call
+        call: RasterCall = ctx.call
         means, quats, scales, viewmats = ctx.saved_tensors
         images, gaussians = call.projected.depths.shape
         # Without a gradient: zeros, but none at all for the depths, which are skipped then.
@@ -257,7 +257,7 @@ class Blend(torch.autograd.Function):
         opacities: torch.Tensor,
         colors: torch.Tensor,
         backgrounds: torch.Tensor,
-        call: Call,
+        call: RasterCall,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """The results of `Project` for `call`, then flat contiguous tensors to blend."""
         ctx.set_materialize_grads(False)
@@ -289,7 +289,7 @@ class Blend(torch.autograd.Function):
     ) -> tuple[torch.Tensor | None, ...]:
         """Gradients of `forward`'s arguments."""
         _refuse_second_order()
-        call: Call = ctx.call
+        call: RasterCall = ctx.call
         opacities, colors, images = ctx.saved_tensors
         if v_images is None:
             v_images = torch.zeros_like(images)

@@ -11,7 +11,7 @@ import torch
 from hwp_bench.methods.settings import number
 from wildghand.gaussians.rig import CHUNK, AnchorPoses
 from wildghand.gaussians.training import join_hands
-from wildghand.plain.recipe import Batch, Drawing, FitSettings, Material, PlainRecipe, RecipeMethod
+from wildghand.plain.recipe import Batch, Drawing, FitInputs, FitSettings, PlainRecipe, RecipeMethod
 
 
 def nearest_turn(pose: np.ndarray, to: np.ndarray) -> np.ndarray:
@@ -92,7 +92,7 @@ class ExposureRecipe(PlainRecipe[ExposureSettings]):
         moving: (R,) bool on the CPU, whether a frame is taken for an exposure.
     """
 
-    def __init__(self, material: Material, settings: ExposureSettings) -> None:
+    def __init__(self, material: FitInputs, settings: ExposureSettings) -> None:
         super().__init__(material, settings)
         indices = material.frames.indices
         signs = torch.tensor([-0.5, 0.5]) * settings.shutter

@@ -9,7 +9,7 @@ import torch
 from hwp_bench.methods.settings import number
 from wildghand.gaussians.training import join_hands
 from wildghand.plain.pose_corrections import PoseCorrections
-from wildghand.plain.recipe import Batch, Drawing, FitSettings, Material, PlainRecipe, RecipeMethod
+from wildghand.plain.recipe import Batch, Drawing, FitInputs, FitSettings, PlainRecipe, RecipeMethod
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ _DM = 10.0
 class JointPoseRecipe(PlainRecipe[JointPoseSettings]):
     """See `PlainRecipe`. Poses of training frames are fitted; betas and test poses are as given."""
 
-    def __init__(self, material: Material, settings: JointPoseSettings) -> None:
+    def __init__(self, material: FitInputs, settings: JointPoseSettings) -> None:
         super().__init__(material, settings)
         self.corrections = PoseCorrections(self.clip)
 

@@ -12,7 +12,7 @@ from hwp_bench.methods.settings import choice, number
 from wildghand.gaussians.attributes import MAX_LOGIT
 from wildghand.gaussians.losses import photometric_loss
 from wildghand.gaussians.training import shares_of_255
-from wildghand.plain.recipe import Batch, Drawing, FitSettings, Material, PlainRecipe, RecipeMethod
+from wildghand.plain.recipe import Batch, Drawing, FitInputs, FitSettings, PlainRecipe, RecipeMethod
 from wildghand.splat import rasterize
 
 #: Depth at which occluders lie, m: nearer than any hand, beyond the rasterizer's near plane.
@@ -156,7 +156,7 @@ class OccludedDrawing(Drawing):
 class OccluderRecipe(PlainRecipe[OccluderSettings]):
     """image = C_occluders + (1 - alpha_occluders) C_hand."""
 
-    def __init__(self, material: Material, settings: OccluderSettings) -> None:
+    def __init__(self, material: FitInputs, settings: OccluderSettings) -> None:
         super().__init__(material, settings)
         frames = material.frames
         self.boxes = mask_boxes(frames.masks)

@@ -24,7 +24,7 @@ from wildghand.network import NetworkSettings
 from wildghand.network.branches import CompactTexture
 from wildghand.network.heads import IdentityMap
 from wildghand.network.surface import Chart
-from wildghand.plain.recipe import Batch, Drawing, LoopSettings, Material, Recipe, RecipeMethod
+from wildghand.plain.recipe import Batch, Drawing, FitInputs, LoopSettings, Recipe, RecipeMethod
 from wildghand.prior.prior import choose_prior
 
 # What the network of the prior is fitted with in WildGHand, of which nothing acts here.
@@ -181,7 +181,7 @@ HALVED_AFTER = (0.02, 0.05, 0.10, 0.20, 0.35, 0.50, 0.75)
 class OneShotRecipe(Recipe[OneShotSettings]):
     """Fit the identity map, the bias of the texture plane, and one gain and offset."""
 
-    def __init__(self, material: Material, settings: OneShotSettings) -> None:
+    def __init__(self, material: FitInputs, settings: OneShotSettings) -> None:
         if settings.frames == "one":
             frames = only(material.frames, choose_frame(material.frames))
             material = replace(material, frames=frames)

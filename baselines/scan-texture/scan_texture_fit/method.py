@@ -14,7 +14,6 @@ from hwp_bench.base.numerics import kd_tree
 from hwp_bench.hands.anchors import anchor_uv
 from hwp_bench.methods.contract import Avatar
 from hwp_bench.methods.settings import number
-from wildghand.evidence.count import seen_anchors
 from wildghand.gaussians.hand_avatar import DrawnAvatar, PosedHands
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.regularizers import surface_laplacian
@@ -22,8 +21,9 @@ from wildghand.gaussians.rig import AnchorPoses, HandRig, make_rig
 from wildghand.gaussians.training import TrainingClip
 from wildghand.network.surface import CellPooling, FixedGather, PlaneSampler
 from wildghand.plain.pose_corrections import PoseCorrections
-from wildghand.plain.recipe import Batch, Drawing, LoopSettings, Material, Recipe, RecipeMethod
+from wildghand.plain.recipe import Batch, Drawing, FitInputs, LoopSettings, Recipe, RecipeMethod
 from wildghand.splat import rasterize
+from wildghand.visibility.count import seen_anchors
 
 _WIDTH = 16
 # Axis-angle of fifteen joints, and two columns of the wrist's rotation.
@@ -319,7 +319,7 @@ class ScanRecipe(Recipe[ScanSettings]):
         unseen: by side, (size, size) 1 where no frame shows a texel; set by the unwrapping.
     """
 
-    def __init__(self, material: Material, settings: ScanSettings) -> None:
+    def __init__(self, material: FitInputs, settings: ScanSettings) -> None:
         super().__init__(material, settings)
         training, device = material.training, material.device
         templates = {side: training.template(side) for side in training.sides}

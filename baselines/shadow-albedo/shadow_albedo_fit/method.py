@@ -15,7 +15,7 @@ from wildghand.gaussians.regularizers import SurfaceLaplacian, surface_laplacian
 from wildghand.gaussians.rig import AnchorPoses
 from wildghand.gaussians.shading import MAX_DEGREE
 from wildghand.plain.model import PlainModel
-from wildghand.plain.recipe import Batch, Drawing, FitSettings, Material, PlainRecipe, RecipeMethod
+from wildghand.plain.recipe import Batch, Drawing, FitInputs, FitSettings, PlainRecipe, RecipeMethod
 from wildghand.splat import rasterize
 
 #: Distance from which the lamp's image is taken, m from the hand's centre.
@@ -183,7 +183,7 @@ class ShadowRecipe(PlainRecipe[ShadowSettings]):
 
     model: ShadowedModel
 
-    def __init__(self, material: Material, settings: ShadowSettings) -> None:
+    def __init__(self, material: FitInputs, settings: ShadowSettings) -> None:
         super().__init__(material, settings)
         # Cameras and posed anchors are known from here on.
         anchors = self.clip.poses(torch.arange(1))

@@ -23,7 +23,7 @@ from wildghand.gaussians.rig import HandRig, make_rig
 from wildghand.gaussians.shading import sh_basis, sh_count
 from wildghand.gaussians.training import TrainingClip, join_hands
 from wildghand.network.surface import bilinear_taps, mirrored_anchors
-from wildghand.plain.recipe import Batch, Drawing, LoopSettings, Material, Recipe, RecipeMethod
+from wildghand.plain.recipe import Batch, Drawing, FitInputs, LoopSettings, Recipe, RecipeMethod
 from wildghand.splat import rasterize
 
 #: What `tools/paint_skins.py` made.
@@ -211,7 +211,7 @@ class SpaceSettings(LoopSettings):
 class SpaceRecipe(Recipe[SpaceSettings]):
     """Fit the weights of the space, a light and the shape."""
 
-    def __init__(self, material: Material, settings: SpaceSettings) -> None:
+    def __init__(self, material: FitInputs, settings: SpaceSettings) -> None:
         super().__init__(material, settings)
         training, device = material.training, material.device
         templates = {side: training.template(side) for side in training.sides}

@@ -12,7 +12,7 @@ from torch.nn.functional import avg_pool2d, pad
 
 from hwp_bench.methods.settings import choice, number
 from wildghand.gaussians.training import FrameTable, upload
-from wildghand.plain.recipe import Batch, Drawing, FitSettings, Material, PlainRecipe, RecipeMethod
+from wildghand.plain.recipe import Batch, Drawing, FitInputs, FitSettings, PlainRecipe, RecipeMethod
 
 #: Bins of the histogram over [0, 1].
 BINS = 10_000
@@ -253,7 +253,7 @@ class TrimmedRecipe(PlainRecipe[TrimmedSettings]):
         network: what `vote` fits; empty with `rules`.
     """
 
-    def __init__(self, material: Material, settings: TrimmedSettings) -> None:
+    def __init__(self, material: FitInputs, settings: TrimmedSettings) -> None:
         super().__init__(material, settings)
         device = material.device
         self.histogram = ErrorHistogram(settings.decay, device)

@@ -17,7 +17,7 @@ from hwp_bench.methods.settings import choice, number
 from wildghand.gaussians.losses import photometric_loss
 from wildghand.gaussians.training import TrainingFrames
 from wildghand.plain.model import PlainAvatar, PlainModel
-from wildghand.plain.recipe import Batch, Drawing, FitSettings, Material, PlainRecipe, RecipeMethod
+from wildghand.plain.recipe import Batch, Drawing, FitInputs, FitSettings, PlainRecipe, RecipeMethod
 from wildghand.splat.threads import denormals_flushed
 
 #: Octaves of the Gaussians' numbers at the start; each is a sine and a cosine by axis.
@@ -260,7 +260,7 @@ class WildRecipe(PlainRecipe[WildSettings]):
             best, which is their mean, over all times that it was drawn; infinite before.
     """
 
-    def __init__(self, material: Material, settings: WildSettings) -> None:
+    def __init__(self, material: FitInputs, settings: WildSettings) -> None:
         super().__init__(material, settings)
         places = []
         for rig in self.model.rigs.values():

@@ -490,7 +490,7 @@ def _tracked_points(clip: ImportedClip) -> np.ndarray:
 
 
 def _caption(clip: ImportedClip, frame: int) -> str:
-    """What the sheet says of a frame."""
+    """The text of the sheet about a frame."""
     number, reading = f"{clip.source.indices[frame]}", clip.source.reading
     if reading is not None and reading.ends_early and frame == len(clip.source.indices) - 1:
         # At the front: long captions are cut.

@@ -446,7 +446,7 @@ def _summed(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class PictureView:
     """A frame without its light, as the mesh lies in it."""
 
     #: (S, S) bool, mesh and hand.
@@ -482,7 +482,7 @@ class TextureResidual(SurfaceResidual):
         super().__init__(pictures, model, self.WEIGHT)
         self.texture = MeanTexture(model.template)
 
-    def view(self, frame: int, drawn: Drawn) -> View:
+    def view(self, frame: int, drawn: Drawn) -> PictureView:
         """Take the light off a frame."""
         inside, depth = drawn.inside, drawn.depth(0.0)
         region = inside & (self.pictures.masks[frame] > 127)
@@ -492,7 +492,7 @@ class TextureResidual(SurfaceResidual):
         grey = cv2.cvtColor(self.pictures.images[frame], cv2.COLOR_RGB2GRAY)
         logs = np.log(grey.astype(np.float32) + self._DARK)
         detail = smooth_within(self._without_light(logs, region), region, 1.0)
-        return View(region, core, detail, depth, _facing(drawn.vertices, drawn.faces))
+        return PictureView(region, core, detail, depth, _facing(drawn.vertices, drawn.faces))
 
     def seen(self, frame: int, drawn: Drawn) -> tuple[np.ndarray, np.ndarray]:
         """Read a frame at each texel: (K,) log grey, and (K,) weights, zero where it is hidden."""
@@ -512,7 +512,7 @@ class TextureResidual(SurfaceResidual):
             self.texture.add(values, weights)
         self.texture.finish()
 
-    def expected(self, view: View, drawn: Drawn) -> tuple[np.ndarray, np.ndarray]:
+    def expected(self, view: PictureView, drawn: Drawn) -> tuple[np.ndarray, np.ndarray]:
         """Draw the mean texture in a frame: (S, S) log grey, and (S, S) bool, whether it counts."""
         inside = view.region
         face = drawn.face[inside]

@@ -56,7 +56,7 @@ def _no_tick() -> None: ...
 
 
 @dataclass(frozen=True)
-class FitSettings:
+class SolveSettings:
     """How long the fit of a clip takes; its weights and scales stand with the residuals."""
 
     #: Steps of Adam from the rigid start, with the world landmarks dominant.
@@ -102,7 +102,7 @@ class FittedClip:
 
     model: ClipModel
     landmarks: LandmarkResidual
-    settings: FitSettings
+    settings: SolveSettings
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ def fit_landmarks(
     landmarks: Landmarks,
     template: HandTemplate,
     footage: Footage,
-    settings: FitSettings,
+    settings: SolveSettings,
     tick: Tick = _no_tick,
 ) -> FittedClip:
     """Fit pose, shape, place and (unless given) focal length to the landmarks of a clip."""

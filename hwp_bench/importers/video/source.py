@@ -48,8 +48,8 @@ from hwp_bench.importers.video.decode import (
 )
 from hwp_bench.importers.video.residuals import FIELD_SIZE
 from hwp_bench.importers.video.solve import (
-    FitSettings,
     Footage,
+    SolveSettings,
     side_scores,
     warn_of_contradiction,
 )
@@ -93,7 +93,7 @@ class VideoImport:
     #: Replace an existing capture.
     overwrite: bool = False
     #: Numbers of the fit.
-    fit: FitSettings = field(default_factory=FitSettings)
+    fit: SolveSettings = field(default_factory=SolveSettings)
 
     def __post_init__(self) -> None:
         # Texts have the bounds that they have in `capture.json`, which is written after all work.

@@ -26,7 +26,7 @@ from hwp_bench.sim.geometry.noise import generator
 from hwp_bench.sim.geometry.surface import RenderCost
 from hwp_bench.sim.light.lights import steady_light
 from hwp_bench.sim.render.frame import carry_out
-from hwp_bench.sim.render.stage import Lens, Stage, render_instant
+from hwp_bench.sim.render.stage import Lens, RenderStage, render_instant
 from hwp_bench.sim.scene.scene import EffectCall, Scene, intrinsics, viewmat, with_effects
 from hwp_bench.sim.scene_files import parse_scene
 from hwp_bench.sim.sensor import Sensor
@@ -138,7 +138,7 @@ def _measure(
 def _pose_loss(scene: Scene, frame: int, size: int, strength: float) -> float:
     """PSNR between a hand and the same hand in an erroneous pose, over the true hand."""
     cost = RenderCost()
-    stage = Stage(scene, cost)
+    stage = RenderStage(scene, cost)
     seconds = plan_frame(scene, frame, scene.frame_count, size).seconds
     hands = hands_at(scene, seconds)
     angle, length = EFFECTS["complex_poses"].estimate_error(strength)

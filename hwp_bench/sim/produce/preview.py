@@ -16,7 +16,7 @@ from hwp_bench.sim.effects import hands_at, lights_at, objects_at, plan_frame
 from hwp_bench.sim.geometry.surface import RenderCost, Surface
 from hwp_bench.sim.light.lights import focus_point
 from hwp_bench.sim.render.frame import SimulatedFrame, render_frame
-from hwp_bench.sim.render.stage import Stage
+from hwp_bench.sim.render.stage import RenderStage
 from hwp_bench.sim.scene.scene import Scene, viewmat
 from hwp_bench.sim.subject.hand import MOVING
 from hwp_bench.taxonomy import perturbation
@@ -102,7 +102,7 @@ def draw_stage(scene: Scene, folder: Path) -> Path:
         ) from error
     plans = [plan_frame(scene, frame, 100, 256) for frame in range(100)]
     recipe = max(plans, key=lambda item: ("objects" in item.passes, sum(item.severity.values())))
-    stage = Stage(scene, RenderCost())
+    stage = RenderStage(scene, RenderCost())
     hands = hands_at(scene, recipe.seconds)
     things = stage.things(objects_at(scene, recipe, recipe.seconds), hands)
     lights = lights_at(scene, recipe)

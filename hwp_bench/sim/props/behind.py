@@ -1,4 +1,4 @@
-"""What is behind the hands: backdrops, and people and things that move before them.
+"""The scene behind the hands: backdrops, and people and things that move before them.
 
 Backdrops are rooms out of focus, or planes close behind in colours of skin. Places of what moves
 are in halves of the picture: x from -1 (left) to 1 (right), y from -1 (top) to 1 (bottom).

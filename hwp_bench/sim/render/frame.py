@@ -27,7 +27,7 @@ from hwp_bench.sim.geometry.noise import generator
 from hwp_bench.sim.geometry.surface import RenderCost, Surface, Tracer, join, transformed
 from hwp_bench.sim.light.lights import FOCUS_DISTANCE, steady_light
 from hwp_bench.sim.props.behind import NOTHING
-from hwp_bench.sim.render.stage import Body, Lens, LinearImage, Stage, between, render_instant
+from hwp_bench.sim.render.stage import Body, Lens, LinearImage, RenderStage, between, render_instant
 from hwp_bench.sim.scene.scene import (
     HandMoment,
     Scene,
@@ -120,7 +120,7 @@ def _seen(look: _Look) -> np.ndarray:
     scene, seconds = look.scene, look.number * look.tick
     # Its own time is that of the pass `auto`; rays are counted as everywhere.
     cost = RenderCost(rays=look.cost.rays)
-    stage = Stage(scene, cost)
+    stage = RenderStage(scene, cost)
     hands = {side: track_moment(scene, side, seconds) for side in scene.sides}
     body = stage.traced(stage.surface(hands, MOVING))
     lens = Lens(intrinsics(scene, EDGE), viewmat(scene, seconds), EDGE, 1, seconds=seconds)
@@ -147,7 +147,9 @@ _ROUNDS = 4
 Knots = tuple[Surface, Surface, Surface]
 
 
-def exposed(stage: Stage, window: Window, sky: dict[str, np.ndarray], lens: Lens) -> LinearImage:
+def exposed(
+    stage: RenderStage, window: Window, sky: dict[str, np.ndarray], lens: Lens
+) -> LinearImage:
     """The mean of the sub-frames: the shutter's integral in linear light.
 
     Hands are posed at the opening, the middle and the closing of the shutter and move on
@@ -239,7 +241,7 @@ class Window:
 class Rows:
     """Hands, sleeves and objects for a sensor that reads its rows in turn."""
 
-    def __init__(self, stage: Stage, window: Window, sky: dict[str, np.ndarray]) -> None:
+    def __init__(self, stage: RenderStage, window: Window, sky: dict[str, np.ndarray]) -> None:
         self._stage = stage
         self._window = window
         self._readout = window.recipe.readout / window.length
@@ -343,7 +345,7 @@ def render_frame(scene: Scene, frame: int, frame_count: int, size: int) -> Simul
 def carry_out(scene: Scene, recipe: FramePlan, size: int) -> SimulatedFrame:
     """Render a frame by its recipe."""
     cost = RenderCost()
-    stage = Stage(scene, cost)
+    stage = RenderStage(scene, cost)
     hands = hands_at(scene, recipe.seconds)
     seconds = recipe.seconds
     lens = Lens(
@@ -410,7 +412,7 @@ def render_view(
     Lamps, windows and walls stay where they are in the world. The backdrop is the one that the
     scene's own camera sees, and nothing moves before it.
     """
-    stage = Stage(scene, cost)
+    stage = RenderStage(scene, cost)
     with cost.time("hands"):
         body = stage.traced(stage.surface(hands))
     with cost.time("sky"):
@@ -444,7 +446,7 @@ _OBJECT = 4
 def frame_layers(scene: Scene, result: SimulatedFrame, frame_count: int, size: int) -> np.ndarray:
     """Compute the layers of a frame: (S, S, 10) float32 in the order of `CHANNELS`."""
     recipe = result.plan
-    stage = Stage(scene, RenderCost())
+    stage = RenderStage(scene, RenderCost())
     seconds = recipe.seconds
     later = seconds + scene.duration / frame_count
     hands = hands_at(scene, seconds)

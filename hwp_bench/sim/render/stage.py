@@ -97,7 +97,7 @@ class Body:
     tracer: Tracer
 
 
-class Stage:
+class RenderStage:
     """Builds what a scene shows."""
 
     def __init__(self, scene: Scene, cost: RenderCost) -> None:

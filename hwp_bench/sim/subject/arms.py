@@ -1,4 +1,4 @@
-"""What a subject's hands carry: a sleeve or a bare forearm, rings, watches and bracelets.
+"""Things that a subject's hands carry: a sleeve or a bare forearm, rings, watches and bracelets.
 
 The forearm's first ring is the hand's own rim, its paint is the hand's painter at places behind
 the wrist, and both share the normals at the rim, so that no seam shows. What is worn is fitted to

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.commitments.recipe import (
-    Recipe,
     RecipeScene,
+    SealedRecipe,
     derived,
     derived_seed,
     read_secret,
@@ -135,9 +135,9 @@ def test_recipes_that_nobody_could_check_are_refused(
 def test_a_recipe_of_another_toolkit_is_named() -> None:
     scene = RecipeScene("capture2", "0" * 64, 20)
     with pytest.raises(UsageError, match="capture2 is another scene"):
-        Recipe((scene,), 64).refuse_other_toolkit()
+        SealedRecipe((scene,), 64).refuse_other_toolkit()
     with pytest.raises(UsageError, match="renderer 1"):
-        Recipe((scene,), 64, renderer=1).refuse_other_toolkit()
+        SealedRecipe((scene,), 64, renderer=1).refuse_other_toolkit()
 
 
 @pytest.mark.parametrize(

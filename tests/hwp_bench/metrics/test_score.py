@@ -37,7 +37,7 @@ from hwp_bench.metrics.pixels import (
 from hwp_bench.metrics.protocol import PSNR_CAP
 from hwp_bench.metrics.score import (
     CaptureScores,
-    Frame,
+    ScoredFrame,
     aggregate,
     mean_scores,
     score_frame,
@@ -288,7 +288,7 @@ def test_what_does_not_fit_is_refused_by_name():
         score_frame(small, small, np.full((10, 10), 255, np.uint8))
 
 
-def frames(count: int) -> list[Frame]:
+def frames(count: int) -> list[ScoredFrame]:
     rng = np.random.default_rng(0)
     mask = np.zeros((40, 44), np.uint8)
     mask[8:30, 10:36] = 255
@@ -296,7 +296,7 @@ def frames(count: int) -> list[Frame]:
     for index in range(count):
         target = rng.integers(0, 256, (40, 44, 3), dtype=np.uint8)
         prediction = np.clip(target + rng.normal(0, 3 + index, target.shape), 0, 255)
-        made.append(Frame(prediction.astype(np.uint8), target, mask))
+        made.append(ScoredFrame(prediction.astype(np.uint8), target, mask))
     return made
 
 
@@ -310,7 +310,7 @@ def test_order_and_scores_do_not_depend_on_the_workers(workers):
 
 def test_a_frame_without_a_prediction_costs_its_penalty_and_no_row():
     listed = frames(3)
-    listed[1] = Frame(None, listed[1].target, listed[1].mask)
+    listed[1] = ScoredFrame(None, listed[1].target, listed[1].mask)
 
     def near(x: np.ndarray, y: np.ndarray) -> float:
         return 0.25
@@ -322,7 +322,7 @@ def test_a_frame_without_a_prediction_costs_its_penalty_and_no_row():
 
 def test_a_fault_of_the_data_set_is_raised_not_penalised():
     good = frames(3)
-    bad = Frame(good[0].prediction, good[0].target, good[0].mask[1:])
+    bad = ScoredFrame(good[0].prediction, good[0].target, good[0].mask[1:])
     with pytest.raises(ShapeMismatch, match="mask"):
         score_frames([*good, bad, *good], workers=2)
 

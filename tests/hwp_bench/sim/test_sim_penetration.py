@@ -25,7 +25,7 @@ from benchmarks.penetration import (
 from hwp_bench.hands.poses import gestures
 from hwp_bench.sim.effects import hands_at
 from hwp_bench.sim.geometry.surface import RenderCost
-from hwp_bench.sim.render.stage import Stage
+from hwp_bench.sim.render.stage import RenderStage
 from hwp_bench.sim.scene.scene import HandKey, moment_of_key, scene_hands
 from hwp_bench.sim.scene_files import load_scene, scene_names
 from hwp_bench.sim.subject.hand import MOVING, SubjectHand
@@ -116,7 +116,9 @@ def _distances(name: str, moment: float) -> tuple[float, float]:
     """How deep the left hand is inside the right one, and how near it is, m."""
     scene = load_scene(name)
     hands = scene_hands(scene, MOVING)
-    parameters = Stage(scene, RenderCost()).parameters(hands_at(scene, moment * scene.duration))
+    parameters = RenderStage(scene, RenderCost()).parameters(
+        hands_at(scene, moment * scene.duration)
+    )
     right, normals = hands["right"].pose(*parameters["right"])
     left, _ = hands["left"].pose(*parameters["left"])
     # Farther away than 30 mm the nearest normal tells nothing; there the distance is infinite.

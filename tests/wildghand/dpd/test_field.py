@@ -12,7 +12,7 @@ from wildghand.dpd.dpd import (
     PLACE_CHANNELS,
     BiasField,
     DynamicPerturbation,
-    Perturbation,
+    FramePerturbation,
     bone_features,
 )
 from wildghand.gaussians.attributes import RawAttributes
@@ -59,8 +59,8 @@ def test_a_module_with_a_field_adds_it_before_omega_and_one_without_is_the_paper
     raw = RawAttributes.split(random(2, 6, 14))
     temporal = module.temporal(torch.tensor([0, 3]))
     field = random(2, 6, 14, seed=2)
-    whole = Perturbation(module, temporal, field=field).biases(raw).concatenate()
-    bare = Perturbation(module, temporal).biases(raw).concatenate()
+    whole = FramePerturbation(module, temporal, field=field).biases(raw).concatenate()
+    bare = FramePerturbation(module, temporal).biases(raw).concatenate()
     torch.testing.assert_close(whole - bare, temporal.omega[:, None, None] * field)
     assert DynamicPerturbation(5, 8).field is None
 

@@ -109,8 +109,8 @@ def test_a_fit_ends_with_the_mean_of_its_steps(share: float, make_training: Trai
 
 def test_a_checkpoint_is_drawn_as_a_fit_that_ends_there(make_training: TrainingMaker) -> None:
     training, drawn = make_training(), {}
-    # What comes after the last step (light, strength of the evidence) is not in a checkpoint.
-    changes = {**FIT, "light.enabled": False, "evidence.enabled": False}
+    # What comes after the last step (light, strength of the visibility) is not in a checkpoint.
+    changes = {**FIT, "light.enabled": False, "visibility.enabled": False}
 
     class Drawing(SilentReport):
         def __call__(self, step: int, avatar: Avatar) -> None:

@@ -59,7 +59,7 @@ def test_looking_ahead_changes_nothing_of_the_fit(fit: Fit) -> None:
 
 
 def test_without_light_all_seconds_are_for_steps(make_training: TrainingMaker) -> None:
-    fit = begun(make_training("right"), **{"light.enabled": False, "evidence.enabled": False})
+    fit = begun(make_training("right"), **{"light.enabled": False, "visibility.enabled": False})
     assert fit.seconds_for_steps(7.0) == 7.0
 
 

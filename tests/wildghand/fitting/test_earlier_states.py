@@ -167,8 +167,8 @@ def test_the_error_is_that_of_the_validation_frames(training: TrainingCapture) -
     judges = part(fit, StateChoice).judges
     assert judges is not None
     assert judges.frames.indices.tolist() == training.validation.tolist()
-    # Evidence is chosen after the state.
-    assert fit.model.evidence is not None
+    # Visibility is chosen after the state.
+    assert fit.model.visibility is not None
     expected = judges.error(judges.predict_all(), None, None)
     assert part(fit, StateChoice).error() == expected > 0.0
 

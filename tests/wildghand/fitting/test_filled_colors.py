@@ -25,8 +25,8 @@ from wildghand.fitting.colors import (
     smooth_fill,
 )
 from wildghand.fitting.data import FitData
-from wildghand.fitting.evidence import FewShown
 from wildghand.fitting.fit import Fit
+from wildghand.fitting.visibility import FewShown
 from wildghand.gaussians.attributes import CHANNELS, SIZES
 from wildghand.gaussians.regularizers import nearest_on_surface, rest_anchors
 from wildghand.gaussians.rig import HandRig, make_rig
@@ -155,7 +155,7 @@ def test_hands_that_frames_show_keep_their_colours(hands: Fit) -> None:
 
 
 def test_where_it_is_off_hands_have_nothing_of_each_other(make_training: TrainingMaker) -> None:
-    fit = begun(make_training("both"), **{"evidence.other_hand": False})
+    fit = begun(make_training("both"), **{"visibility.other_hand": False})
     filled = known_of(fit, left=0.0, right=0.999)
     changed, none = filled.carried_on([0.02, 0.0])
     assert none is None
@@ -163,7 +163,7 @@ def test_where_it_is_off_hands_have_nothing_of_each_other(make_training: Trainin
     np.testing.assert_allclose(changed.changes["left"], 0.0, atol=1e-4)
 
 
-@pytest.mark.parametrize("changes", [{"evidence.fill_share": 0.0}, {"evidence.enabled": False}])
+@pytest.mark.parametrize("changes", [{"visibility.fill_share": 0.0}, {"visibility.enabled": False}])
 def test_nothing_is_filled_where_it_is_off(
     changes: dict[str, Any], make_training: TrainingMaker
 ) -> None:

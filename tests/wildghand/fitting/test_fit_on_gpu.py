@@ -92,7 +92,7 @@ def test_a_stopped_fit_goes_on(make_training: TrainingMaker, tmp_path: Path) -> 
 
     stopped, again = fit(), fit()
 
-    def save(step: int, watchers: Watchers) -> None:
+    def save(step: int, watchers: Watchers, loss: object) -> None:
         if step == STEPS // 2:
             save_state(file, stopped, watchers, step=step, seconds=1.0, digest="d")
 

@@ -14,7 +14,7 @@ from tiny_fits import UNJUDGED
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.fitting.components import make_fit
 from wildghand.fitting.data import skin_places
-from wildghand.fitting.fit import Batch, Fit
+from wildghand.fitting.fit import Fit, StepBatch
 from wildghand.fitting.judging import MARGIN, HiddenSkin, hidden_skin
 from wildghand.fitting.weights import MaskWeights
 from wildghand.model.settings import read_settings
@@ -64,8 +64,8 @@ def test_hidden_pixels_are_compared_with_what_is_drawn(
 ) -> None:
     fit, hidden = covered(make_training(), **{"pao.enabled": pao})
     assert hidden.sum() > 20
-    drawing = fit.draw(Batch(torch.tensor([0])))
-    target = fit.compare(Batch(torch.tensor([0])), drawing)
+    drawing = fit.draw(StepBatch(torch.tensor([0])))
+    target = fit.compare(StepBatch(torch.tensor([0])), drawing)
     assert torch.equal(target.image[0][hidden], drawing.image.detach()[0][hidden])
     masked = (
         fit.data.frames.images[0].float() / 255.0 * (fit.data.frames.masks[0] / 255.0)[..., None]
@@ -80,10 +80,10 @@ def test_hidden_pixels_ask_for_nothing_where_they_are_left_out(
     """The gradient of the image is 0 in them without SSIM, whose windows reach the others."""
     changes = {"terms.leave_hidden": leave, "terms.dssim_weight": 0.0, "pao.enabled": False}
     fit, hidden = covered(make_training(), **changes)
-    drawing = fit.draw(Batch(torch.tensor([0])))
+    drawing = fit.draw(StepBatch(torch.tensor([0])))
     drawing.image.retain_grad()
-    target = fit.compare(Batch(torch.tensor([0])), drawing)
-    batch = Batch(torch.tensor([0]))
+    target = fit.compare(StepBatch(torch.tensor([0])), drawing)
+    batch = StepBatch(torch.tensor([0]))
     terms = [term for each in fit.components for term in each.loss(fit, batch, drawing, target)]
     torch.stack(terms).sum().backward()
     asked = drawing.image.grad[0].abs().sum(dim=-1)

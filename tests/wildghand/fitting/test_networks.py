@@ -23,7 +23,7 @@ from hwp_bench.methods.contract import RunSettings, TrainingCapture
 from wildghand.avatar.files import load_avatar
 from wildghand.cli.main import main as wildghand
 from wildghand.fitting.components import make_fit
-from wildghand.fitting.fit import Batch
+from wildghand.fitting.fit import StepBatch
 from wildghand.fitting.judging import hand_masks, hand_roots
 from wildghand.fitting.method import check_networks
 from wildghand.model.settings import read_settings
@@ -53,7 +53,7 @@ def weights(training: TrainingCapture, **changes: Any) -> torch.Tensor:
     fit = make_fit(training, read_settings({**FIT, **changes}), 0, torch.device("cpu"))
     rows = torch.arange(3)
     with torch.no_grad():
-        return fit.compare(Batch(rows), fit.draw(Batch(rows))).weights
+        return fit.compare(StepBatch(rows), fit.draw(StepBatch(rows))).weights
 
 
 def options(settings: dict[str, Any]) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import math
 import multiprocessing
 import os
@@ -212,7 +213,9 @@ def test_torchrun_makes_one_avatar_and_one_message(
 ) -> None:
     capture, avatar = make_painted().root, tmp_path / "avatar"
     options = [
-        word for name, value in (SHORT | QUICK).items() for word in ("--set", f"{name}={value}")
+        word
+        for name, value in (SHORT | QUICK).items()
+        for word in ("--set", f"{name}={json.dumps(value)}")
     ]
     command = ["fit", str(capture), "-o", str(avatar), "--steps", "2", *options]
     made = torchrun(command)

@@ -18,7 +18,7 @@ from tiny_fits import TINY
 
 from hwp_bench.hands import pose_hand, project
 from hwp_bench.methods.contract import Budget, TrainingCapture
-from wildghand.fitting.fit import Batch, Component, Fit
+from wildghand.fitting.fit import Component, Fit, StepBatch
 from wildghand.fitting.method import affordable
 from wildghand.fitting.objective import Reconstruction, Regularisers, choose_perceptual
 from wildghand.fitting.weights import Pao
@@ -64,7 +64,7 @@ def mean(values: torch.Tensor) -> float:
 @pytest.mark.parametrize("mode", ["paper", "released"])
 def test_the_loss_is_the_sum_of_its_terms(mode: str, make_training: TrainingMaker) -> None:
     fit = fit_of(make_training("both"), mode)
-    batch, released = Batch(ROWS), mode == "released"
+    batch, released = StepBatch(ROWS), mode == "released"
     with torch.no_grad():
         drawing = fit.draw(batch)
         target = fit.compare(batch, drawing)
@@ -146,8 +146,8 @@ def test_released_compares_with_the_frame_in_front_of_black_and_with_the_posed_m
     masks[:, :, masks.shape[2] // 2 :] = 0
     fit.data.replace_masks(masks)
     part(fit, Pao).weights.T_b.data.fill_(50.0)
-    drawing = fit.draw(Batch(ROWS))
-    target = fit.compare(Batch(ROWS), drawing)
+    drawing = fit.draw(StepBatch(ROWS))
+    target = fit.compare(StepBatch(ROWS), drawing)
     silhouettes = fit.data.silhouettes(ROWS).numpy()
     posed = np.stack([filled(training, fit.data.frames.indices[row]) for row in ROWS])
     assert posed.sum() > 500
@@ -229,12 +229,12 @@ def test_steps_leave_the_geometry_branch_out_by_the_chance_that_is_set(
 ) -> None:
     fit = fit_of(make_training(), "released", **{"schedule.geometry_dropout": 0.5})
     rows = torch.arange(8)
-    drawing = fit.draw(Batch(rows, stepping=True), kept=None)
+    drawing = fit.draw(StepBatch(rows, stepping=True), kept=None)
     raw = drawing.hands["right"].prediction.raw.concatenate()
     network = fit.model.network
     alone = network.attributes_of_texture("right", network.features("right")).concatenate()
     plain = [torch.allclose(frame, alone, atol=1e-6) for frame in raw]
     assert 0 < sum(plain) < 8
     # The avatar itself, and frames that are looked at, have all of it.
-    looked = fit.draw(Batch(rows)).hands["right"].prediction.raw.concatenate()
+    looked = fit.draw(StepBatch(rows)).hands["right"].prediction.raw.concatenate()
     assert not any(torch.allclose(frame, alone, atol=1e-6) for frame in looked)

@@ -13,7 +13,6 @@ from odd_fits import part
 from tiny_fits import UNJUDGED
 
 from hwp_bench.methods.contract import TrainingCapture
-from wildghand.evidence.count import read_images, seen_anchors
 from wildghand.fitting.colors import start_from_colors, tint_share
 from wildghand.fitting.components import make_fit
 from wildghand.fitting.fit import Fit
@@ -21,6 +20,7 @@ from wildghand.fitting.light import Lighting, best_of_each_part
 from wildghand.gaussians.training import TrainingFrames
 from wildghand.light import CastLight, ShadowTable
 from wildghand.model.settings import read_settings
+from wildghand.visibility.count import read_images, seen_anchors
 
 PLAIN: dict[str, Any] = {
     **UNJUDGED,

@@ -15,7 +15,7 @@ from hwp_bench.methods.contract import TrainingCapture
 from wildghand.fitting.components import make_fit
 from wildghand.fitting.data import FitData
 from wildghand.fitting.disentangle import Dpd
-from wildghand.fitting.fit import Batch, Fit
+from wildghand.fitting.fit import Fit, StepBatch
 from wildghand.fitting.judging import Prepass
 from wildghand.fitting.weights import Pao
 from wildghand.gaussians.training import TrainingFrames
@@ -66,11 +66,11 @@ def test_a_mismatch_that_all_frames_share_lifts_what_they_teach(
     alone = 1.0 / (1.0 + 100.0 * 0.2)
     np.testing.assert_allclose(shares, [1.0, alone + tolerance * (1.0 - alone)], rtol=1e-6)
     # Regions that are rejected keep that share of the hand's weight.
-    drawing = fit.draw(Batch(ROWS))
-    lifted = fit.compare(Batch(ROWS), drawing).weights
+    drawing = fit.draw(StepBatch(ROWS))
+    lifted = fit.compare(StepBatch(ROWS), drawing).weights
     monkeypatch.setattr(PaoSettings, "mismatch", 0.0)
     without = fit_of(training, **{"subject.enabled": False})
-    strict = without.compare(Batch(ROWS), drawing).weights
+    strict = without.compare(StepBatch(ROWS), drawing).weights
     assert (lifted >= strict - 1e-6).all()
     assert lifted.sum() > strict.sum()
     monkeypatch.undo()
@@ -94,7 +94,7 @@ def test_all_frames_teach_alike_where_a_part_of_it_is_missing(
 ) -> None:
     fit = fit_of(make_training(), **changes)
     found = fit.part(Pao)
-    assert found is None or "teach" not in found.draws(fit, Batch(ROWS))
+    assert found is None or "teach" not in found.draws(fit, StepBatch(ROWS))
 
 
 @pytest.mark.usefixtures("_strict")
@@ -107,10 +107,10 @@ def test_the_prepass_lowers_covered_pixels_with_pao_and_without(
         fit_of(training, **{"pao.enabled": pao, "prepass.enabled": on}) for on in (True, False)
     )
     assessment = part(fit, Prepass).assessment
-    drawing = fit.draw(Batch(ROWS))
+    drawing = fit.draw(StepBatch(ROWS))
     weights, whole = (
-        fit.compare(Batch(ROWS), drawing).weights,
-        bare.compare(Batch(ROWS), drawing).weights,
+        fit.compare(StepBatch(ROWS), drawing).weights,
+        bare.compare(StepBatch(ROWS), drawing).weights,
     )
     expected = whole * torch.from_numpy(assessment.pixel_weights[ROWS.numpy()]).float() / 255.0
     torch.testing.assert_close(weights.detach(), expected.detach(), rtol=1e-5, atol=1e-6)
@@ -154,9 +154,9 @@ def test_regions_of_clean_frames_are_lifted_by_how_clean_they_are(
     strict = fit_of(training)
     clean = spares.data.judgement.clean[ROWS]
     assert (clean > 0.0).all()
-    drawing = spares.draw(Batch(ROWS))
-    found = spares.compare(Batch(ROWS), drawing)
-    lower = strict.compare(Batch(ROWS), drawing).weights
+    drawing = spares.draw(StepBatch(ROWS))
+    found = spares.compare(StepBatch(ROWS), drawing)
+    lower = strict.compare(StepBatch(ROWS), drawing).weights
     outside = spares.settings.terms.outside_weight * (1.0 - found.hand)
     pixels = spares.data.uncovered(ROWS)
     regions = lower - outside * pixels
@@ -167,9 +167,9 @@ def test_regions_of_clean_frames_are_lifted_by_how_clean_they_are(
 def test_regions_that_are_drawn_badly_count_less(make_training: TrainingMaker) -> None:
     fit = fit_of(make_training(), **{"prepass.enabled": False})
     row = torch.tensor([0])
-    drawing = fit.draw(Batch(row))
-    target = fit.compare(Batch(row), drawing)
-    hand = fit.compare(Batch(row), drawing).hand[0] > 0.9
+    drawing = fit.draw(StepBatch(row))
+    target = fit.compare(StepBatch(row), drawing)
+    hand = fit.compare(StepBatch(row), drawing).hand[0] > 0.9
     error = (drawing.image[0].detach() - target.image[0]).abs().mean(dim=-1)
     worst, best = (error >= error[hand].quantile(0.9)), (error <= error[hand].quantile(0.1))
     weights = target.weights[0].detach()
@@ -202,15 +202,16 @@ def test_without_heads_the_template_stands_and_nothing_else_changes(
             for value in made.model.network.template_head.parameters():
                 value.fill_(0.05)
     row = torch.tensor([0])
-    moved = fit.draw(Batch(row)).hands["right"].prediction.template_offsets
-    still = bare.draw(Batch(row)).hands["right"].prediction.template_offsets
+    moved = fit.draw(StepBatch(row)).hands["right"].prediction.template_offsets
+    still = bare.draw(StepBatch(row)).hands["right"].prediction.template_offsets
     assert moved.abs().max() > 0.0
     assert (still == 0.0).all()
     raw = (
-        made.draw(Batch(row)).hands["right"].prediction.raw.concatenate() for made in (fit, bare)
+        made.draw(StepBatch(row)).hands["right"].prediction.raw.concatenate()
+        for made in (fit, bare)
     )
     assert torch.equal(*raw)
-    bare.loss(Batch(row)).backward()
+    bare.loss(StepBatch(row)).backward()
     assert all(
         value.grad is None or not value.grad.any()
         for value in bare.model.network.template_head.parameters()

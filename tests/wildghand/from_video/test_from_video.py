@@ -32,7 +32,7 @@ from wildghand.avatar.files import load_avatar
 from wildghand.cli.main import main
 from wildghand.from_video import VideoFit, make_avatar, stages
 from wildghand.from_video.run import QUICK as QUICK_CHANGES
-from wildghand.from_video.run import QUICK_FRAMES, Job, with_quick
+from wildghand.from_video.run import QUICK_FRAMES, VideoJob, with_quick
 from wildghand.from_video.stages import STAGES, import_options, stride
 from wildghand.model.settings import read_settings
 
@@ -330,7 +330,7 @@ def test_two_hands_by_default(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     score = np.where((np.arange(COUNT) < 10) | (tracks.right > 0.5), tracks.score, 0.0)
     write_hand_tracks(landmarks, replace(tracks, score=score.astype(np.float32)))
     capsys.readouterr()
-    assert import_options(Job(video, tmp_path / "other", options)).side == "right"
+    assert import_options(VideoJob(video, tmp_path / "other", options)).side == "right"
     assert "The left hand is in 8 of 16 frames only" in capsys.readouterr().err
     with pytest.raises(BadInput, match="shows a left hand in 8 of 16 frames"):
         make_avatar(video, tmp_path / "other", replace(options, side="both"))

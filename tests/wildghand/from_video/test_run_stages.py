@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 
 from hwp_bench.base.errors import BadInput, HwpError
 from wildghand.from_video.run import (
-    Job,
     JobRecord,
     Stage,
     StageRecord,
     VideoFit,
+    VideoJob,
     read_record,
     run_stages,
     seconds_left,
@@ -35,29 +35,29 @@ class _Step(Stage):
     def _old(self) -> str:
         return "" if self.before is None else self.workshop.result(self.before).read_text()
 
-    def facts(self, job: Job) -> dict[str, str]:
+    def facts(self, job: VideoJob) -> dict[str, str]:
         old = {} if self.before is None else {self.before: self._old()}
         return {**old, f"input of {self.name}": self.workshop.inputs[self.name]}
 
-    def result(self, job: Job) -> Path:
+    def result(self, job: VideoJob) -> Path:
         return self.workshop.result(self.name)
 
-    def run(self, job: Job) -> None:
+    def run(self, job: VideoJob) -> None:
         self.workshop.ran.append(self.name)
         if self.workshop.stop_in == self.name:
             raise KeyboardInterrupt
         made = f"{self._old()}{self.name}:{self.workshop.inputs[self.name]};"
         self.result(job).write_text(made)
 
-    def expected(self, job: Job) -> float:
+    def expected(self, job: VideoJob) -> float:
         return 1.0
 
-    def discard(self, job: Job) -> None:
+    def discard(self, job: VideoJob) -> None:
         self.workshop.discarded.append(self.name)
 
 
 class Failing(_Step):
-    def run(self, job: Job) -> None:
+    def run(self, job: VideoJob) -> None:
         raise HwpError("no luck")
 
 
@@ -65,7 +65,7 @@ class Workshop:
     """Three stages, one on the other."""
 
     def __init__(self, folder: Path) -> None:
-        self.job = Job(folder / "video.mp4", folder / "hand", VideoFit())
+        self.job = VideoJob(folder / "video.mp4", folder / "hand", VideoFit())
         self.inputs = dict.fromkeys(NAMES, "a")
         self.ran: list[str] = []
         self.discarded: list[str] = []

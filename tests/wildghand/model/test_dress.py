@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from wildghand.dpd.dpd import DynamicPerturbation, Perturbation
+from wildghand.dpd.dpd import DynamicPerturbation, FramePerturbation
 from wildghand.gaussians.attributes import Activation, RawAttributes
 from wildghand.gaussians.rig import AnchorPoses
 from wildghand.model.dress import dress
@@ -62,7 +62,7 @@ class Scene:
         )
         perturbation = None
         if biased:
-            perturbation = Perturbation(
+            perturbation = FramePerturbation(
                 self.module,
                 self.module.temporal(self.frames),
                 kept,

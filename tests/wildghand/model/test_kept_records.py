@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 
 from hwp_bench.base.errors import BadInput
-from wildghand.evidence import ColorChanges, Evidence
 from wildghand.gaussians.found import Found
 from wildghand.light import CastLight, KnownLight
 from wildghand.model.model import FOUND
 from wildghand.poses import ClipPoses
 from wildghand.subject import SubjectShape
+from wildghand.visibility import ColorChanges, Visibility
 
 COUNTS = {"N": {"left": 4, "right": 5}}
 #: What is read with it, and an example.
@@ -34,9 +34,9 @@ EXAMPLES: dict[type[Found], tuple[dict[str, Any], Found]] = {
             {"right": np.ones((4, 51), np.float32)}, {"right": np.zeros((4, 51), np.float32)}
         ),
     ),
-    Evidence: (
+    Visibility: (
         COUNTS,
-        Evidence(
+        Visibility(
             {side: torch.linspace(0.0, 1.0, n) for side, n in COUNTS["N"].items()},
             {side: torch.full((n,), 0.25) for side, n in COUNTS["N"].items()},
             frozenset({"left"}),

@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from wildghand.evidence.count import camera_centres
 from wildghand.gaussians.attributes import RawAttributes
 from wildghand.gaussians.rig import AnchorPoses
 from wildghand.light import KnownLight
 from wildghand.model.frames import carried_on, relit
 from wildghand.network import NetworkOutput
+from wildghand.visibility.count import camera_centres
 
 COUNT = 40
 

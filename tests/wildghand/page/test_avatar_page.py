@@ -28,7 +28,7 @@ from hwp_bench.methods.contract import HandPose
 from wildghand.avatar import WildGHandAvatar, load_avatar, save_avatar
 from wildghand.cli.main import main
 from wildghand.fitting.components import make_fit
-from wildghand.fitting.fit import Batch
+from wildghand.fitting.fit import StepBatch
 from wildghand.model.settings import read_settings
 from wildghand.page import bake_hand, write_page
 from wildghand.page.bake import bake_biases, joint_motions
@@ -232,13 +232,13 @@ def test_without_webgl_a_picture_is_shown(page: Path, tmp_path: Path) -> None:
 
 def test_gaussians_of_a_frame_are_those_that_the_fit_draws(make_training: Any) -> None:
     training = make_training("right")
-    settings = read_settings({**QUICK, "evidence.enabled": False, "light.enabled": False})
+    settings = read_settings({**QUICK, "visibility.enabled": False, "light.enabled": False})
     fit = make_fit(training, settings, 0, torch.device("cpu"))
     with torch.no_grad():
         fit.model.biases_of("right").psi.bias.fill_(1.0)
         fit.model.log_gains.fill_(-0.3)
         row = torch.tensor([4])
-        drawn = fit.draw(Batch(row))
+        drawn = fit.draw(StepBatch(row))
         frame = int(fit.data.frames.indices[4])
         avatar = fit.avatar(0)
         given = avatar.posed({"right": training.hand_poses(frame)["right"]})["right"]

@@ -13,13 +13,13 @@ from hwp_bench.methods.contract import Budget
 from wildghand.gaussians.training import load_frames
 from wildghand.plain.loop import run_fit
 from wildghand.plain.model import PlainAvatar
-from wildghand.plain.recipe import Batch, Drawing, FitSettings, Material, PlainRecipe, RecipeMethod
+from wildghand.plain.recipe import Batch, Drawing, FitInputs, FitSettings, PlainRecipe, RecipeMethod
 
 
 class FrameGain(PlainRecipe[FitSettings]):
     """One factor for each frame, and a record of the order of the hooks."""
 
-    def __init__(self, material: Material, settings: FitSettings) -> None:
+    def __init__(self, material: FitInputs, settings: FitSettings) -> None:
         super().__init__(material, settings)
         self.log_gains = torch.zeros(len(material.frames))
         self.calls: list[str] = []
@@ -58,7 +58,7 @@ class GainMethod(RecipeMethod):
 def gain_recipe(make_training: TrainingMaker, **settings: Any) -> FrameGain:
     training = make_training()
     method = GainMethod({**QUICK, **settings})
-    material = Material(training, load_frames(training), 0, method.device)
+    material = FitInputs(training, load_frames(training), 0, method.device)
     return FrameGain(material, method.settings)
 
 
@@ -119,7 +119,7 @@ def test_a_fit_that_diverges_later_goes_back_to_its_best_state(
 
     training = make_training()
     method = GainMethod(QUICK)
-    recipe = Breaking(Material(training, load_frames(training), 0, method.device), method.settings)
+    recipe = Breaking(FitInputs(training, load_frames(training), 0, method.device), method.settings)
     avatar = run_fit(recipe, Budget(steps=200), SilentReport())
     assert isinstance(avatar, PlainAvatar)
     assert avatar.steps in (50, 100)

@@ -29,7 +29,7 @@ from hwp_bench.methods.request import open_request, write_request
 from wildghand.avatar.files import load_avatar
 from wildghand.cli.main import main
 from wildghand.fitting.components import make_fit
-from wildghand.fitting.fit import Batch, Fit
+from wildghand.fitting.fit import Fit, StepBatch
 from wildghand.fitting.session import load_state, save_state
 from wildghand.model.settings import read_settings
 from wildghand.network import network_settings
@@ -89,9 +89,11 @@ def mean_loss(fit: Fit) -> float:
         losses = []
         for row in range(len(fit.data.frames)):
             rows = torch.tensor([row])
-            drawing = fit.draw(Batch(rows))
-            target = fit.compare(Batch(rows), drawing)
-            terms = (t for c in fit.components for t in c.loss(fit, Batch(rows), drawing, target))
+            drawing = fit.draw(StepBatch(rows))
+            target = fit.compare(StepBatch(rows), drawing)
+            terms = (
+                t for c in fit.components for t in c.loss(fit, StepBatch(rows), drawing, target)
+            )
             losses.append(torch.stack(list(terms)).sum())
         return float(torch.stack(losses).mean())
 

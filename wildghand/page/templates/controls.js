@@ -245,7 +245,7 @@ function start() {
     changed();
   }
   one("shown").addEventListener("input", () => setShown(one("shown").value));
-  one("evidence").hidden = !hands.some((hand) => hand.seen);
+  one("visibility").hidden = !hands.some((hand) => hand.seen);
   one("unseen").addEventListener("input", () => changed());
   one("background").addEventListener("input", () => changed(false));
   new ResizeObserver(() => changed(false)).observe(canvas);

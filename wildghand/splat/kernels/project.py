@@ -25,7 +25,7 @@ from wildghand.splat.kernels.jit import inline, jobs, kernel
 from wildghand.splat.kernels.tiles import ROW, TILE_HEIGHT
 from wildghand.splat.kernels.triples import by, cross, dot, plus, scaled, times
 from wildghand.splat.kernels.vectors import (
-    Call,
+    LoweredCall,
     Vector,
     ceil,
     floor,
@@ -59,7 +59,7 @@ def make_load_columns(columns: int) -> Any:
     """
 
     @lowered(lambda array, index: types.UniTuple(EXACT, columns))
-    def load_columns(code: Call, array: Any, index: Any) -> ir.Value:
+    def load_columns(code: LoweredCall, array: Any, index: Any) -> ir.Value:
         whole = code.load(array, index, ir.VectorType(ir.FloatType(), GROUP * columns))
         parts = []
         for column in range(columns):
@@ -86,7 +86,7 @@ def _as_rows(builder: ir.IRBuilder, parts: Sequence[ir.Value]) -> ir.Value:
 
 
 @lowered(lambda array, index, values: types.void)
-def add_columns(code: Call, array: Any, index: Any, values: Any) -> None:
+def add_columns(code: LoweredCall, array: Any, index: Any, values: Any) -> None:
     """Adds a tuple of float64 vectors to 8 rows of a float32 array; saturates, never inf."""
     builder, rows = code.builder, _as_rows(code.builder, code.unpack(values))
     single = ir.VectorType(ir.FloatType(), rows.type.count)
@@ -98,7 +98,7 @@ def add_columns(code: Call, array: Any, index: Any, values: Any) -> None:
 
 
 @lowered(lambda array, index, values: types.void)
-def store_columns(code: Call, array: Any, index: Any, values: Any) -> None:
+def store_columns(code: LoweredCall, array: Any, index: Any, values: Any) -> None:
     """Writes a tuple of float64 vectors to 8 rows of an array of float32 or int32."""
     if code.sig.args[0].dtype == types.float32:
         parts = [code.builder.fptrunc(part, _SINGLE) for part in code.unpack(values)]
@@ -112,7 +112,7 @@ def store_columns(code: Call, array: Any, index: Any, values: Any) -> None:
         types.void if isinstance(values, types.UniTuple) and values.count == 2 * GROUP else None
     )
 )
-def store_rows(code: Call, array: Any, index: Any, values: Any) -> None:
+def store_rows(code: LoweredCall, array: Any, index: Any, values: Any) -> None:
     """`store_columns` of 16 columns, of which a single shuffle would be slow."""
     builder = code.builder
     parts = [builder.fptrunc(part, _SINGLE) for part in code.unpack(values)]
@@ -135,13 +135,13 @@ def store_rows(code: Call, array: Any, index: Any, values: Any) -> None:
 
 
 @lowered(lambda value: value)
-def round32(code: Call, value: Any) -> ir.Value:
+def round32(code: LoweredCall, value: Any) -> ir.Value:
     """float64 lanes rounded to the precision of float32."""
     return code.builder.fpext(code.builder.fptrunc(value, _SINGLE), EXACT.llvm)
 
 
 @lowered(lambda value: types.float64)
-def total(code: Call, value: Any) -> ir.Value:
+def total(code: LoweredCall, value: Any) -> ir.Value:
     """Sum of the lanes of a float64 vector, in a fixed order."""
     width = GROUP
     while width > 1:

@@ -36,7 +36,7 @@ from numba.extending import overload
 from wildghand.splat import conventions as rules
 from wildghand.splat.kernels.jit import inline
 from wildghand.splat.kernels.vectors import (
-    Call,
+    LoweredCall,
     Vector,
     absolute,
     add_exponent,
@@ -285,7 +285,7 @@ def _count(channels):
 
 
 @lowered(lambda array, index, channels: types.UniTuple(array.dtype, channels.count))
-def _load_tuple(code: Call, array: Any, index: Any, channels: Any) -> ir.Value:
+def _load_tuple(code: LoweredCall, array: Any, index: Any, channels: Any) -> ir.Value:
     builder = code.builder
     places = [builder.add(index, ir.Constant(index.type, k)) for k in range(channels.type.count)]
     return code.pack([builder.load(code.place(array, place)) for place in places])
@@ -331,7 +331,7 @@ def project(state, at, colors, color, channels):
 
 
 @lowered(lambda channels: types.UniTuple(PIXELS, channels.count))
-def _zero_tuple(code: Call, channels: Any) -> ir.Value:
+def _zero_tuple(code: LoweredCall, channels: Any) -> ir.Value:
     return code.pack([PIXELS.constant(0.0)] * channels.type.count)
 
 

@@ -166,7 +166,7 @@ for _name, _emit in (("and_", ir.IRBuilder.and_), ("or_", ir.IRBuilder.or_)):
     )
 
 
-class Call(NamedTuple):
+class LoweredCall(NamedTuple):
     """A call of an intrinsic that is being lowered."""
 
     context: Any
@@ -197,7 +197,7 @@ class Call(NamedTuple):
 
 
 def lowered(result: Callable[..., Any]) -> Callable[[Callable[..., Any]], Any]:
-    """Decorator: an intrinsic, whose function emits the code from a `Call` and the values.
+    """Decorator: an intrinsic, whose function emits the code from a `LoweredCall` and the values.
 
     Args:
         result: from the types of the arguments, that of the value, or a signature, or None where
@@ -214,7 +214,7 @@ def lowered(result: Callable[..., Any]) -> Callable[[Callable[..., Any]], Any]:
                 sig = sig(*(types.intp if isinstance(a, types.Integer) else a for a in args))
 
             def codegen(context: Any, builder: Any, sig: Any, values: Any) -> ir.Value:
-                made = emit(Call(context, builder, sig), *values)
+                made = emit(LoweredCall(context, builder, sig), *values)
                 return context.get_dummy_value() if made is None else made
 
             return sig, codegen
@@ -233,7 +233,7 @@ def make_constant(vector: Vector, values: Iterable[float]) -> Any:
     held = [float(value) for value in values]
 
     @lowered(lambda: vector)
-    def constant(code: Call) -> ir.Value:
+    def constant(code: LoweredCall) -> ir.Value:
         return ir.Constant(vector.llvm, held)
 
     return constant
@@ -243,7 +243,7 @@ def make_fill(vector: Vector) -> Any:
     """An intrinsic that puts one number into every lane."""
 
     @lowered(lambda value: vector(vector.element))
-    def fill(code: Call, value: Any) -> ir.Value:
+    def fill(code: LoweredCall, value: Any) -> ir.Value:
         return splat(code.builder, value, vector.lanes)
 
     return fill
@@ -253,27 +253,29 @@ def make_load(vector: Vector) -> Any:
     """An intrinsic that reads consecutive elements, `load(array, flat_index)`."""
 
     @lowered(lambda array, index: vector)
-    def load(code: Call, array: Any, index: Any) -> ir.Value:
+    def load(code: LoweredCall, array: Any, index: Any) -> ir.Value:
         return code.load(array, index, vector.llvm)
 
     return load
 
 
 @lowered(_nothing)
-def store(code: Call, array: Any, index: Any, value: Any) -> None:
+def store(code: LoweredCall, array: Any, index: Any, value: Any) -> None:
     """Writes a vector over consecutive elements: `store(array, flat_index, vector)`."""
     code.store(array, index, value)
 
 
 @lowered(lambda a, b, c: vector_of((a, b, c)))
-def fma(code: Call, a: Any, b: Any, c: Any) -> ir.Value:
+def fma(code: LoweredCall, a: Any, b: Any, c: Any) -> ir.Value:
     """a * b + c with one rounding, in every lane; scalars are spread."""
     vector = code.sig.return_type
     return call(code.builder, "fma", vector, widen(code.builder, vector, (a, b, c), code.sig.args))
 
 
 @lowered(lambda array, index, stride, weight, sums: sums)
-def add_lines(code: Call, array: Any, index: Any, stride: Any, weight: Any, sums: Any) -> ir.Value:
+def add_lines(
+    code: LoweredCall, array: Any, index: Any, stride: Any, weight: Any, sums: Any
+) -> ir.Value:
     """`sums`, to each of which weight times a vector is added; the vectors are `stride` apart."""
     vector, made = code.sig.return_type.dtype, []
     (weight,) = widen(code.builder, vector, [weight], code.sig.args[3:4])
@@ -286,7 +288,7 @@ def add_lines(code: Call, array: Any, index: Any, stride: Any, weight: Any, sums
 
 
 @lowered(_nothing)
-def store_lines(code: Call, array: Any, index: Any, stride: Any, values: Any) -> None:
+def store_lines(code: LoweredCall, array: Any, index: Any, stride: Any, values: Any) -> None:
     """Writes the vectors of a tuple, `stride` apart."""
     for value in code.unpack(values):
         code.store(array, index, value)
@@ -297,7 +299,7 @@ def _make_unary(name: str) -> Any:
     """An intrinsic that applies an LLVM intrinsic of one argument in every lane."""
 
     @lowered(lambda a: a)
-    def unary(code: Call, a: Any) -> ir.Value:
+    def unary(code: LoweredCall, a: Any) -> ir.Value:
         return call(code.builder, name, code.sig.return_type, [a])
 
     return unary
@@ -315,46 +317,46 @@ ceil = _make_unary("ceil")
         vector_of((a, b)) if isinstance(mask, Mask) and _mask_of(a, b) == mask else None
     )
 )
-def select(code: Call, mask: Any, a: Any, b: Any) -> ir.Value:
+def select(code: LoweredCall, mask: Any, a: Any, b: Any) -> ir.Value:
     """`a` in the lanes where the mask holds, `b` in the others; scalars are spread."""
     yes, no = widen(code.builder, code.sig.return_type, (a, b), code.sig.args[1:])
     return code.builder.select(mask, yes, no)
 
 
 @lowered(lambda mask, values: values)
-def keep(code: Call, mask: Any, values: Any) -> ir.Value:
+def keep(code: LoweredCall, mask: Any, values: Any) -> ir.Value:
     """A tuple of vectors where the mask holds, else zeros, even where it is NaN."""
     zero = code.sig.return_type.dtype.constant(0.0)
     return code.pack([code.builder.select(mask, value, zero) for value in code.unpack(values)])
 
 
 @lowered(lambda a: a)
-def negate(code: Call, a: Any) -> ir.Value:
+def negate(code: LoweredCall, a: Any) -> ir.Value:
     """The sign turned in every lane."""
     return code.builder.fneg(a)
 
 
 @lowered(lambda mask: types.uint64 if isinstance(mask, Mask) else None)
-def bits(code: Call, mask: Any) -> ir.Value:
+def bits(code: LoweredCall, mask: Any) -> ir.Value:
     """The mask as an integer, lane 0 in the lowest bit."""
     number = code.builder.bitcast(mask, ir.IntType(code.sig.args[0].lanes))
     return code.builder.zext(number, _I64)
 
 
 @lowered(lambda number: types.intp(types.uint64))
-def lowest_bit(code: Call, number: Any) -> ir.Value:
+def lowest_bit(code: LoweredCall, number: Any) -> ir.Value:
     """Index of the lowest set bit of a number that is not zero."""
     return code.builder.cttz(number, ir.Constant(ir.IntType(1), 1))
 
 
 @lowered(lambda number: types.intp(types.uint64))
-def count_bits(code: Call, number: Any) -> ir.Value:
+def count_bits(code: LoweredCall, number: Any) -> ir.Value:
     """How many bits of a number are set."""
     return code.builder.ctpop(number)
 
 
 @lowered(lambda value, shifted: value)
-def add_exponent(code: Call, value: Any, shifted: Any) -> ir.Value:
+def add_exponent(code: LoweredCall, value: Any, shifted: Any) -> ir.Value:
     """value * 2**n, where n sits in the low bits of `shifted` = n + 1.5 * 2**23 (float32)."""
     builder, whole = code.builder, ir.VectorType(_I32, value.type.count)
     by = ir.Constant(whole, [23] * value.type.count)
@@ -363,7 +365,7 @@ def add_exponent(code: Call, value: Any, shifted: Any) -> ir.Value:
 
 
 @lowered(lambda value: types.UniTuple(value, 2))
-def split_exponent(code: Call, value: Any) -> ir.Value:
+def split_exponent(code: LoweredCall, value: Any) -> ir.Value:
     """(m, n) with value = m * 2**n and m in [0.75, 1.5), for normal positive float64."""
     builder, lanes = code.builder, value.type.count
     whole = ir.VectorType(_I64, lanes)
@@ -375,14 +377,14 @@ def split_exponent(code: Call, value: Any) -> ir.Value:
 
 
 @lowered(lambda array, index: types.int64)
-def atomic_add_one(code: Call, array: Any, index: Any) -> ir.Value:
+def atomic_add_one(code: LoweredCall, array: Any, index: Any) -> ir.Value:
     """Adds one to an element of an int64 array that threads share, and returns the value before."""
     place = code.place(array, index)
     return code.builder.atomic_rmw("add", place, ir.Constant(_I64, 1), "monotonic")
 
 
 @lowered(_nothing)
-def prefetch(code: Call, array: Any, index: Any) -> None:
+def prefetch(code: LoweredCall, array: Any, index: Any) -> None:
     """Asks for the cache line of an element before it is needed."""
     byte = ir.IntType(8).as_pointer()
     function = code.builder.module.declare_intrinsic(
@@ -394,7 +396,7 @@ def prefetch(code: Call, array: Any, index: Any) -> None:
 
 
 @lowered(lambda a: Vector(types.float32, a.lanes))
-def narrow(code: Call, a: Any) -> ir.Value:
+def narrow(code: LoweredCall, a: Any) -> ir.Value:
     """float64 lanes rounded to float32."""
     return code.builder.fptrunc(a, code.sig.return_type.llvm)
 
@@ -406,7 +408,7 @@ def narrow(code: Call, a: Any) -> ir.Value:
         else None
     )
 )
-def store_sums(code: Call, array: Any, index: Any, vectors: Any) -> None:
+def store_sums(code: LoweredCall, array: Any, index: Any, vectors: Any) -> None:
     """Writes the sum over the lanes of each vector of a tuple to consecutive elements.
 
     As many elements are written as fill whole vectors; those beyond the tuple hold nothing of

@@ -34,10 +34,10 @@ from hwp_bench.importers.video.model import (
 from hwp_bench.importers.video.residuals import OutlineResidual, signed_distance
 from hwp_bench.importers.video.solve import (
     CLEAR,
-    FitSettings,
     FittedClip,
     Footage,
     SideScores,
+    SolveSettings,
     fit_landmarks,
     fit_outline,
     reprojection_error,
@@ -47,7 +47,7 @@ from hwp_bench.importers.video.solve import (
 from hwp_bench.importers.video.source import VideoImport, read_source
 
 CENTRE = np.array([WIDTH / 2, HEIGHT / 2])
-SETTINGS = FitSettings(start_steps=80, landmark_steps=200, contour_steps=60)
+SETTINGS = SolveSettings(start_steps=80, landmark_steps=200, contour_steps=60)
 
 
 def fit(clip: SyntheticClip, landmarks: Landmarks, focal: float | None = FOCAL) -> FittedClip:
@@ -154,7 +154,7 @@ def test_a_left_hand_is_fitted_by_the_left_template() -> None:
 
 def test_the_fit_repeats_exactly_and_gives_torchs_threads_back() -> None:
     before = torch.get_num_threads()
-    clip, few = make_clip(6), FitSettings(start_steps=8, landmark_steps=8)
+    clip, few = make_clip(6), SolveSettings(start_steps=8, landmark_steps=8)
     footage = Footage(WIDTH, HEIGHT, FPS, FOCAL)
     first, second = (fit_landmarks(clip.landmarks, clip.template, footage, few) for _ in range(2))
     ours, theirs = (f.model.parameters(clip.landmarks.detected) for f in (first, second))
@@ -166,7 +166,7 @@ def test_the_fit_repeats_exactly_and_gives_torchs_threads_back() -> None:
 def test_a_fit_that_leaves_the_numbers_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hwp_bench.importers.video.residuals.WORLD_SCALE", 1e-30)
     clip = make_clip(4)
-    settings = FitSettings(start_steps=2)
+    settings = SolveSettings(start_steps=2)
     with pytest.raises(DidNotConverge):
         fit_landmarks(clip.landmarks, clip.template, Footage(WIDTH, HEIGHT, FPS, FOCAL), settings)
 
@@ -194,7 +194,7 @@ def test_outline_vertices_are_those_of_the_hand_model(correctives: bool) -> None
         basis = np.random.default_rng(0).normal(0, 1e-3, (len(hand.vertices), 3, 135))
         hand = rebuilt(hand, pose_basis=basis)
     footage = Footage(WIDTH, HEIGHT, FPS, FOCAL)
-    quick = FitSettings(start_steps=20, landmark_steps=1)
+    quick = SolveSettings(start_steps=20, landmark_steps=1)
     fitted = fit_landmarks(clip.landmarks, hand, footage, quick)
     windows = follow_hands([clip.landmarks], FPS, 96)
     masks = [

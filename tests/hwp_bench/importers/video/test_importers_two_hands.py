@@ -21,9 +21,9 @@ from hwp_bench.hands import pose_hand
 from hwp_bench.hands.raster import overlap
 from hwp_bench.importers.shared.landmarks import read_landmarks
 from hwp_bench.importers.video import (
-    FitSettings,
     FrameRange,
     ImportedClip,
+    SolveSettings,
     VideoImport,
     import_video,
 )
@@ -32,7 +32,7 @@ from hwp_bench.importers.video.source import read_source
 from hwp_bench.results import read_results
 
 FRAMES, SWAPS, GAP = 16, (4, 9, 13), range(7, 9)
-QUICK = FitSettings(
+QUICK = SolveSettings(
     start_steps=60,
     landmark_steps=90,
     contour_steps=20,
@@ -129,7 +129,7 @@ def test_masks_are_of_both_hands(imported: ImportedClip, folder: Path, clip: Two
 
 def test_two_hands_get_one_focal_length(clip: TwoHandClip) -> None:
     """Oracle: the mean of both; with no step after it, no joint moves in the image."""
-    footage, few = Footage(WIDTH, HEIGHT, FPS, None), FitSettings(start_steps=3, landmark_steps=3)
+    footage, few = Footage(WIDTH, HEIGHT, FPS, None), SolveSettings(start_steps=3, landmark_steps=3)
     fits = [
         fit_landmarks(hand.landmarks, hand.template, footage, few) for hand in clip.hands.values()
     ]

@@ -29,11 +29,11 @@ from hwp_bench.hands import load_template, pose_hand, project
 from hwp_bench.hands.raster import overlap
 from hwp_bench.importers.video.api import IMPORTER_VERSION, drop_blank_frames, import_video
 from hwp_bench.importers.video.decode import FrameRange, probe, read_frames
-from hwp_bench.importers.video.solve import FitSettings
+from hwp_bench.importers.video.solve import SolveSettings
 from hwp_bench.importers.video.source import VideoImport, read_source
 
 FRAMES = 16
-QUICK = FitSettings(
+QUICK = SolveSettings(
     start_steps=60, landmark_steps=120, contour_steps=30, contour_rounds=1, picture_rounds=1
 )
 #: The same without texture and pictures, where the fit is not what is asked about.
@@ -165,7 +165,7 @@ def test_a_video_that_ends_early_is_recorded(
 def test_the_command_prints_the_numbers_and_saves_the_sheet(
     folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(FitSettings, "__init__", lambda self: _set(self, QUICKER))
+    monkeypatch.setattr(SolveSettings, "__init__", lambda self: _set(self, QUICKER))
     sheet = folder / "sheet.png"
     words = ["data", "import-video", str(folder / "hand.avi"), str(folder / "by_command")]
     words += ["--landmarks", str(folder / "hand.npz"), "--size", "96", "--frames", "6:16"]
@@ -187,12 +187,12 @@ def test_the_command_prints_the_numbers_and_saves_the_sheet(
     assert read_rgb(sheet).shape[0] > 96
     assert main([*words, "--min-score", "0.4"]) == 2
     assert "exists already" in capsys.readouterr().err
-    monkeypatch.setattr(FitSettings, "__init__", lambda self: _set(self, HASTY))
+    monkeypatch.setattr(SolveSettings, "__init__", lambda self: _set(self, HASTY))
     assert main([*words, "--force", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["frames"] == 5
 
 
-def _set(settings: FitSettings, values: FitSettings) -> None:
+def _set(settings: SolveSettings, values: SolveSettings) -> None:
     settings.__dict__.update(values.__dict__)
 
 
@@ -314,7 +314,7 @@ def test_a_part_of_the_real_video(tmp_path: Path) -> None:
     # Frames 590 to 621 open and make a fist, fast; the bound is 8 px at 1280x720.
     options = VideoImport(
         frames=FrameRange(590, 621),
-        fit=FitSettings(start_steps=80, landmark_steps=200, contour_steps=60, picture_rounds=2),
+        fit=SolveSettings(start_steps=80, landmark_steps=200, contour_steps=60, picture_rounds=2),
     )
     result = import_video(
         REAL / "human_hand_video.mp4", REAL / "landmarks.npz", tmp_path / "real", options

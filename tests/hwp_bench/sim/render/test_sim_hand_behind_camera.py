@@ -17,7 +17,7 @@ from hwp_bench.sim.effects import hands_at, plan_frame
 from hwp_bench.sim.geometry.surface import RenderCost, Surface
 from hwp_bench.sim.light.lights import FOCUS_DISTANCE
 from hwp_bench.sim.render.frame import SUPERSAMPLING, SimulatedFrame, render_frame
-from hwp_bench.sim.render.stage import Stage
+from hwp_bench.sim.render.stage import RenderStage
 from hwp_bench.sim.scene.scene import Scene, intrinsics, pixel_rays, viewmat
 from hwp_bench.sim.sensor import Sensor
 
@@ -76,7 +76,7 @@ def test_of_a_hand_around_the_camera_the_part_before_it_is_drawn(make_scene: Sce
     scene = placed(make_scene, 0.05, -FOCUS_DISTANCE, tilt=50.0)
     result = render_frame(scene, CLEAN, COUNT, SIZE)
     seconds = plan_frame(scene, CLEAN, COUNT, SIZE).seconds
-    surface = Stage(scene, RenderCost()).surface(hands_at(scene, seconds))
+    surface = RenderStage(scene, RenderCost()).surface(hands_at(scene, seconds))
     view = viewmat(scene, seconds)
     depths = surface.vertices @ view[2, :3] + view[2, 3]
     assert depths.min() < -0.02

@@ -19,7 +19,7 @@ from hwp_bench.sim.effects import hands_at, plan_frame
 from hwp_bench.sim.geometry.surface import RenderCost
 from hwp_bench.sim.hand.anatomy import Anatomy
 from hwp_bench.sim.render.frame import render_frame
-from hwp_bench.sim.render.stage import Stage
+from hwp_bench.sim.render.stage import RenderStage
 from hwp_bench.sim.scene.scene import Scene
 from hwp_bench.sim.subject.arms import ring_mounts, wrist_loop
 from hwp_bench.sim.subject.hand import MOVING, of_side, painted, sample_skin, subject_hand
@@ -132,7 +132,7 @@ def test_a_ring_lies_on_its_finger_and_keeps_its_shape(make_scene: SceneMaker, s
     for seconds in (0.0, 1.0):
         hands = hands_at(scene, seconds)
         skin, normals = subject_hand(subject, side).pose(
-            *Stage(scene, RenderCost()).parameters(hands)[side]
+            *RenderStage(scene, RenderCost()).parameters(hands)[side]
         )
         for mount in ring_mounts(subject, side):
             ring = mount.carried(skin)
@@ -150,7 +150,7 @@ def test_a_ring_lies_on_its_finger_and_keeps_its_shape(make_scene: SceneMaker, s
 def test_a_bare_arm_begins_with_the_rim_of_the_hand(make_scene: SceneMaker) -> None:
     subject = wearing(arm="bare", wrist=(WristWear("watch", side="both"),))
     scene = replace(make_scene(), subject=subject)
-    stage = Stage(scene, RenderCost())
+    stage = RenderStage(scene, RenderCost())
     hands = hands_at(scene, 0.7)
     body = stage.surface(hands)
     rim = wrist_loop(subject, "right").loop

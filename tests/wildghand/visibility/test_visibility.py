@@ -15,17 +15,17 @@ from tiny_fits import UNJUDGED
 
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.avatar.files import load_avatar, save_avatar
-from wildghand.evidence import (
-    ColorChanges,
-    Evidence,
-    EvidenceSettings,
-    shown_frames,
-    weigh_evidence,
-)
-from wildghand.evidence.count import _FAR, _depth_image
 from wildghand.fitting.components import make_fit
 from wildghand.gaussians.attributes import Activation, RawAttributes
 from wildghand.model.settings import read_settings
+from wildghand.visibility import (
+    ColorChanges,
+    Visibility,
+    VisibilitySettings,
+    shown_frames,
+    weigh_visibility,
+)
+from wildghand.visibility.count import _FAR, _depth_image
 
 SPACING = 2e-3
 TrainingMaker = Callable[..., TrainingCapture]
@@ -36,15 +36,15 @@ def raw_attributes(count: int = 40, seed: int = 0) -> RawAttributes:
     return RawAttributes.split(torch.randn(2, count, 14, generator=generator))
 
 
-def evidence(offsets: float, shapes: float, count: int = 40) -> Evidence:
-    return Evidence(
+def visibility(offsets: float, shapes: float, count: int = 40) -> Visibility:
+    return Visibility(
         {"right": torch.full((count,), offsets)}, {"right": torch.full((count,), shapes)}
     )
 
 
-def test_with_all_the_evidence_gaussians_are_drawn_as_they_were() -> None:
+def test_with_all_the_visibility_gaussians_are_drawn_as_they_were() -> None:
     raw, activation = raw_attributes(), Activation()
-    settled = evidence(1.0, 1.0).settle("right", raw, SPACING, activation.log_scale_bias)
+    settled = visibility(1.0, 1.0).settle("right", raw, SPACING, activation.log_scale_bias)
     before, after = activation(raw), activation(settled)
     for name in ("offsets", "scales", "opacities", "colors"):
         torch.testing.assert_close(getattr(after, name), getattr(before, name))
@@ -52,9 +52,9 @@ def test_with_all_the_evidence_gaussians_are_drawn_as_they_were() -> None:
     torch.testing.assert_close(turns, torch.ones_like(turns))
 
 
-def test_without_evidence_gaussians_are_opaque_discs_on_the_skin_in_their_colours() -> None:
+def test_without_visibility_gaussians_are_opaque_discs_on_the_skin_in_their_colours() -> None:
     raw, activation = raw_attributes(), Activation()
-    settled = evidence(0.0, 0.0).settle("right", raw, SPACING, activation.log_scale_bias)
+    settled = visibility(0.0, 0.0).settle("right", raw, SPACING, activation.log_scale_bias)
     drawn = activation(settled)
     assert not drawn.offsets.any()
     disc = torch.tensor([0.6, 0.6, 0.2]) * SPACING
@@ -78,9 +78,9 @@ def amounts(most: float) -> st.SearchStrategy[float]:
 def test_shares_are_those_of_the_formula(
     shown: float, count: int, offset: float, shape: float
 ) -> None:
-    settings = EvidenceSettings(offset_share=offset)
-    with mock.patch.object(EvidenceSettings, "shape_share", shape):
-        found = weigh_evidence({"left": torch.tensor([shown])}, count, settings)
+    settings = VisibilitySettings(offset_share=offset)
+    with mock.patch.object(VisibilitySettings, "shape_share", shape):
+        found = weigh_visibility({"left": torch.tensor([shown])}, count, settings)
     for share, half in ((found.offsets, offset), (found.shapes, shape)):
         expected = np.float64(shown) / (shown + half * count) if half else 1.0
         expected = 0.0 if np.isnan(expected) else expected
@@ -119,11 +119,11 @@ def test_frames_show_what_faces_them_and_lies_in_the_mask(make_training: Trainin
         torch.testing.assert_close(half[side], 0.5 * found)
 
 
-def test_an_avatar_keeps_its_evidence(make_training: TrainingMaker, tmp_path: Path) -> None:
+def test_an_avatar_keeps_its_visibility(make_training: TrainingMaker, tmp_path: Path) -> None:
     training = make_training()
     fit = make_fit(training, read_settings(UNJUDGED), 0, torch.device("cpu"))
     bare = make_fit(
-        training, read_settings({**UNJUDGED, "evidence.enabled": False}), 0, torch.device("cpu")
+        training, read_settings({**UNJUDGED, "visibility.enabled": False}), 0, torch.device("cpu")
     )
     frame = int(training.validation[0])
     where = training.hand_poses(frame), training.camera(frame)

@@ -24,8 +24,8 @@ from wildghand.gaussians.found import Found, Kept, read_tensor
 
 
 @dataclass(frozen=True)
-class EvidenceSettings:
-    """How much evidence outweighs that a Gaussian is an opaque disc on the skin."""
+class VisibilitySettings:
+    """How much visibility outweighs that a Gaussian is an opaque disc on the skin."""
 
     #: Draw free poses with Gaussians that are the more discs on the skin, the fewer frames have
     #: shown them.
@@ -44,17 +44,17 @@ class EvidenceSettings:
     shape_share: ClassVar[float] = 0.002
 
 
-_WALLS = "evidence_wall_"
+_WALLS = "visibility_wall_"
 # The disc: standard deviations along the skin and across it, in spacings of the anchors, and its
 # opacity before the sigmoid.
 _WIDE, _THIN, _OPAQUE = 0.6, 0.2, 4.0
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence(Found):
+class Visibility(Found):
     """The share of what a fit has found that is kept of each Gaussian, in [0, 1]."""
 
-    prefix = "evidence_"
+    prefix = "visibility_"
     #: (N,) by side, of the offset.
     offsets: Annotated[Mapping[str, Tensor], Kept(("N",), 0.0, 1.0)]
     #: (N,) by side, of scales, orientation and transparency.
@@ -65,7 +65,7 @@ class Evidence(Found):
     def settle(
         self, side: str, raw: RawAttributes, spacing: float, log_scale_bias: float
     ) -> RawAttributes:
-        """Bring Gaussians nearer to discs on the skin, by what is missing of the evidence.
+        """Bring Gaussians nearer to discs on the skin, by what is missing of the visibility.
 
         Args:
             spacing: mean distance between neighbouring anchors, m.
@@ -85,7 +85,7 @@ class Evidence(Found):
             logit_colors=raw.logit_colors,
         )
 
-    def spare(self, chosen: Mapping[str, Tensor]) -> Evidence:
+    def spare(self, chosen: Mapping[str, Tensor]) -> Visibility:
         """Keep all of some Gaussians.
 
         Args:
@@ -100,7 +100,7 @@ class Evidence(Found):
 
         return replace(self, offsets=kept(self.offsets), shapes=kept(self.shapes))
 
-    def spare_all(self) -> Evidence:
+    def spare_all(self) -> Visibility:
         """Keep all of all Gaussians."""
         return self.spare({side: torch.ones_like(share) > 0 for side, share in self.shapes.items()})
 
@@ -115,7 +115,7 @@ class Evidence(Found):
     @classmethod
     def from_tensors(
         cls, tensors: Mapping[str, Tensor], where: str, **sizes: int | Mapping[str, int]
-    ) -> Evidence | None:
+    ) -> Visibility | None:
         """Read what `to_tensors` made; see `Found.from_tensors`."""
         found = super().from_tensors(tensors, where, **sizes)
         if found is None:
@@ -127,7 +127,9 @@ class Evidence(Found):
         return replace(found, open_wrists=frozenset(s for s, wall in walls.items() if wall <= 0.5))
 
 
-def weigh_evidence(shown: Mapping[str, Tensor], count: int, settings: EvidenceSettings) -> Evidence:
+def weigh_visibility(
+    shown: Mapping[str, Tensor], count: int, settings: VisibilitySettings
+) -> Visibility:
     """The shares that follow from how many frames show each Gaussian.
 
     Frames of a clip that follow one another show the same, so that what counts is their share.
@@ -139,7 +141,7 @@ def weigh_evidence(shown: Mapping[str, Tensor], count: int, settings: EvidenceSe
     def shares(half: float) -> dict[str, Tensor]:
         return {side: kept_share(frames, half) for side, frames in shown.items()}
 
-    return Evidence(shares(settings.offset_share * count), shares(settings.shape_share * count))
+    return Visibility(shares(settings.offset_share * count), shares(settings.shape_share * count))
 
 
 def kept_share(frames: Tensor, half: float) -> Tensor:
@@ -153,7 +155,7 @@ def kept_share(frames: Tensor, half: float) -> Tensor:
     return frames / (frames + half).clamp(min=1e-12)
 
 
-def strengths(settings: EvidenceSettings) -> list[EvidenceSettings]:
+def strengths(settings: VisibilitySettings) -> list[VisibilitySettings]:
     """The strengths among which validation frames choose, the settings' own first.
 
     The others are a quarter and four times of its `offset_share`, and offsets as they were learnt.
@@ -162,7 +164,7 @@ def strengths(settings: EvidenceSettings) -> list[EvidenceSettings]:
     return [settings, *(replace(settings, offset_share=factor * share) for factor in (0.25, 4, 0))]
 
 
-def fill_shares(settings: EvidenceSettings) -> list[float]:
+def fill_shares(settings: VisibilitySettings) -> list[float]:
     """The values of `fill_share` among which validation frames choose, the settings' own first.
 
     The others are five times as much, and colours as they were learnt.

@@ -1,4 +1,4 @@
-"""The choice of the strengths of evidence and fill. Oracles: the avatar's own pictures as truth."""
+"""The strengths of visibility and fill are chosen. Oracles: the avatar's own pictures as truth."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ from tiny_fits import UNJUDGED
 from hwp_bench.capture.splits import Split
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.avatar.files import load_avatar, save_avatar
-from wildghand.evidence import (
-    ColorChanges,
-    Evidence,
-    EvidenceSettings,
-    fill_shares,
-    strengths,
-    weigh_evidence,
-)
 from wildghand.fitting.choice import StateChoice
 from wildghand.fitting.colors import FilledColors
 from wildghand.fitting.data import FitData
-from wildghand.fitting.evidence import FewShown, Gaps
 from wildghand.fitting.fit import Fit
+from wildghand.fitting.visibility import FewShown, Gaps
 from wildghand.gaussians.training import load_validation_frames
 from wildghand.model.dress import Gaussians
 from wildghand.model.frames import rasterize_hands
 from wildghand.subject.fit_subject import LEAST_CHOOSING
+from wildghand.visibility import (
+    ColorChanges,
+    Visibility,
+    VisibilitySettings,
+    fill_shares,
+    strengths,
+    weigh_visibility,
+)
 
 QUICK: dict[str, Any] = {**UNJUDGED, "light.enabled": False}
 TrainingMaker = Callable[..., TrainingCapture]
@@ -56,34 +56,36 @@ def training(make_training: TrainingMaker) -> TrainingCapture:
     return made
 
 
-def spared(fit: Fit, index: int) -> Evidence:
-    """The evidence of one of the strengths, without the Gaussians that close gaps."""
-    several = strengths(fit.settings.evidence)
-    evidence = [
-        weigh_evidence(part(fit, FewShown).shown, len(fit.data.frames), each) for each in several
+def spared(fit: Fit, index: int) -> Visibility:
+    """The visibility of one of the strengths, without the Gaussians that close gaps."""
+    several = strengths(fit.settings.visibility)
+    visibility = [
+        weigh_visibility(part(fit, FewShown).shown, len(fit.data.frames), each) for each in several
     ]
     # The third opens the most: it asks for four times the frames.
-    return evidence[index].spare(part(fit, FewShown).gaps.closers(evidence[2]))
+    return visibility[index].spare(part(fit, FewShown).gaps.closers(visibility[2]))
 
 
 def drawn_with(fit: Fit, training: TrainingCapture, index: int) -> np.ndarray:
     """(F, H, W, 3) validation frames as the avatar draws them with one of the strengths."""
-    before = fit.model.evidence
-    fit.model.evidence = spared(fit, index)
+    before = fit.model.visibility
+    fit.model.visibility = spared(fit, index)
     avatar = fit.avatar(0)
     images = [
         avatar.render(training.hand_poses(frame), training.camera(frame))[..., :3]
         for frame in training.validation.tolist()
     ]
-    fit.model.evidence = before
+    fit.model.visibility = before
     return np.clip(np.stack(images), 0.0, 1.0)
 
 
-def error_with(choice: FewShown, evidence: Evidence | None, colors: ColorChanges | None) -> float:
+def error_with(
+    choice: FewShown, visibility: Visibility | None, colors: ColorChanges | None
+) -> float:
     """The error of all validation frames as they are drawn with both."""
     drawings = choice.judges
     assert drawings is not None
-    return drawings.error(drawings.predict_all(), evidence, colors)
+    return drawings.error(drawings.predict_all(), visibility, colors)
 
 
 def judged_by(choice: FewShown, images: torch.Tensor) -> FewShown:
@@ -104,7 +106,7 @@ def test_errors_are_those_of_the_avatars_pictures(training: TrainingCapture) -> 
     inside = [cv2.erode((mask > 127).astype(np.uint8), erode) for mask in frames.masks.numpy()]
     hand = np.stack(inside)[..., None]
     truth = frames.images.numpy() / 255.0
-    for index in range(len(strengths(fit.settings.evidence))):
+    for index in range(len(strengths(fit.settings.visibility))):
         off = (drawn_with(fit, training, index) - truth) ** 2 * hand
         expected = off.sum() / hand.sum() / 3.0
         found = error_with(part(fit, FewShown), spared(fit, index), None)
@@ -118,10 +120,10 @@ def test_the_strength_that_draws_the_frames_best_is_chosen(
     fit = begun(training)
     images = torch.from_numpy((255.0 * drawn_with(fit, training, index)).round().astype(np.uint8))
     choice = judged_by(part(fit, FewShown), images)
-    (evidence,) = choice.best(fit)
-    assert isinstance(evidence, Evidence)
-    assert evidence.equals(spared(fit, index))
-    fit.model.keep(evidence)
+    (visibility,) = choice.best(fit)
+    assert isinstance(visibility, Visibility)
+    assert visibility.equals(spared(fit, index))
+    fit.model.keep(visibility)
     assert choice.best(fit) == []  # the model has it already
 
 
@@ -130,18 +132,18 @@ def test_gaussians_stay_as_learnt_where_that_draws_the_frames_much_better(
 ) -> None:
     fit = begun(training)
     learnt = spared(fit, 0).spare_all()
-    before, fit.model.evidence = fit.model.evidence, learnt
+    before, fit.model.visibility = fit.model.visibility, learnt
     avatar = fit.avatar(0)
     drawn = [
         avatar.render(training.hand_poses(frame), training.camera(frame))[..., :3]
         for frame in training.validation.tolist()
     ]
-    fit.model.evidence = before
+    fit.model.visibility = before
     images = torch.from_numpy((255.0 * np.clip(np.stack(drawn), 0.0, 1.0)).round().astype(np.uint8))
-    (evidence,) = judged_by(part(fit, FewShown), images).best(fit)
-    assert isinstance(evidence, Evidence)
-    assert evidence.equals(learnt)
-    assert all(bool((shares == 1.0).all()) for shares in evidence.shapes.values())
+    (visibility,) = judged_by(part(fit, FewShown), images).best(fit)
+    assert isinstance(visibility, Visibility)
+    assert visibility.equals(learnt)
+    assert all(bool((shares == 1.0).all()) for shares in visibility.shapes.values())
 
 
 def test_a_wall_in_the_way_is_left_out_and_stays_out_of_a_file(
@@ -161,36 +163,36 @@ def test_a_wall_in_the_way_is_left_out_and_stays_out_of_a_file(
         def predict_all(self) -> dict[int, Any]:
             return {}
 
-        def error(self, _: Any, evidence: Evidence, __: Any) -> float:
-            return 1.0 if side in evidence.open_wrists else 2.0
+        def error(self, _: Any, visibility: Visibility, __: Any) -> float:
+            return 1.0 if side in visibility.open_wrists else 2.0
 
     choice = part(fit, FewShown)
     choice.judges = Walls()  # type: ignore[assignment]
     fit.model.keep(spared(fit, 0))
-    (evidence,) = choice.best(fit)
-    assert isinstance(evidence, Evidence)
-    assert evidence.equals(opened)
+    (visibility,) = choice.best(fit)
+    assert isinstance(visibility, Visibility)
+    assert visibility.equals(opened)
 
 
-def test_evidence_has_no_say_in_the_choice_of_a_state(training: TrainingCapture) -> None:
+def test_visibility_has_no_say_in_the_choice_of_a_state(training: TrainingCapture) -> None:
     fit = odd_fit(training, {**QUICK, "schedule.validated": True})
     expected = part(fit, StateChoice).error()
-    discs = weigh_evidence(
+    discs = weigh_visibility(
         {side: torch.zeros_like(count) for side, count in part(fit, FewShown).shown.items()},
         len(fit.data.frames),
-        fit.settings.evidence,
+        fit.settings.visibility,
     )
     fit.model.keep(discs)
     assert part(fit, StateChoice).error() == expected
 
 
 class GapModel:
-    """Nine Gaussians side by side and a tenth apart from them, which evidence takes away."""
+    """Nine Gaussians side by side and a tenth apart from them, which visibility takes away."""
 
     def __init__(self) -> None:
         self.rigs = {"right": range(10)}
         self.log_gains = torch.zeros(1, 3)
-        self.evidence: Evidence | None = None
+        self.visibility: Visibility | None = None
 
     def gaussians(self, side: str, *hand: torch.Tensor) -> tuple[Gaussians, Any]:
         """Fill a square of 12 px on the left; the last one is a spot on the right."""
@@ -198,7 +200,7 @@ class GapModel:
         means = torch.stack(
             [*torch.meshgrid(grid - 4.0, grid + 4.0, indexing="ij"), torch.full((3, 3), 32.0)], -1
         ).reshape(1, 9, 3)
-        far = means[:, :1] if self.evidence is not None else torch.tensor([[[10.0, 0.0, 32.0]]])
+        far = means[:, :1] if self.visibility is not None else torch.tensor([[[10.0, 0.0, 32.0]]])
         made = Gaussians(
             means=torch.cat([means, far], dim=1),
             quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(1, 10, 4),
@@ -224,15 +226,15 @@ def test_gaussians_that_close_a_gap_are_found(seen: bool) -> None:
     )
     visible = torch.full((1, 32, 32), float(seen))
     gaps = Gaps(model, clip, lambda rows: visible, frames)  # type: ignore[arg-type]
-    found = gaps.closers(Evidence({}, {}))["right"]
+    found = gaps.closers(Visibility({}, {}))["right"]
     assert found.tolist() == [False] * 9 + [seen]
-    assert model.evidence is None
+    assert model.visibility is None
 
 
 def test_all_of_what_is_spared_is_kept() -> None:
     shares = {"right": torch.tensor([0.0, 0.25, 0.5])}
     chosen = {"right": torch.tensor([True, False, False])}
-    spared = Evidence(shares, shares, frozenset({"right"})).spare(chosen)
+    spared = Visibility(shares, shares, frozenset({"right"})).spare(chosen)
     assert spared.offsets["right"].tolist() == [1.0, 0.25, 0.5]
     assert spared.shapes["right"].tolist() == [1.0, 0.25, 0.5]
     assert spared.open_wrists == {"right"}
@@ -252,7 +254,7 @@ def test_the_border_of_an_estimated_mask_judges_nothing(training: TrainingCaptur
 
 
 def test_strengths_are_around_the_settings_own() -> None:
-    own = EvidenceSettings(offset_share=0.2)
+    own = VisibilitySettings(offset_share=0.2)
     shares = [(one.offset_share, one.shape_share) for one in strengths(own)]
     assert shares == [(0.2, 0.002), (0.05, 0.002), (0.8, 0.002), (0.0, 0.002)]
 
@@ -267,7 +269,7 @@ def test_the_fill_that_draws_the_frames_best_is_chosen(
     shown = {side: 0.05 * count for side, count in part(fit, FewShown).shown.items()}
     choice, filled = copy.copy(part(fit, FewShown)), FilledColors(fit, shown)
     choice.filled = filled
-    fills = filled.carried_on(fill_shares(fit.settings.evidence))
+    fills = filled.carried_on(fill_shares(fit.settings.visibility))
     fit.model.color_changes = fills[index]
     images = torch.from_numpy((255.0 * drawn_with(fit, training, 0)).round().astype(np.uint8))
     fit.model.color_changes = None
@@ -284,8 +286,8 @@ def test_the_fill_that_draws_the_frames_best_is_chosen(
 
 
 def test_fills_are_around_the_settings_own() -> None:
-    assert fill_shares(EvidenceSettings(fill_share=0.04)) == [0.04, 0.2, 0.0]
-    assert fill_shares(EvidenceSettings(fill_share=0.0)) == [0.0]
+    assert fill_shares(VisibilitySettings(fill_share=0.04)) == [0.04, 0.2, 0.0]
+    assert fill_shares(VisibilitySettings(fill_share=0.0)) == [0.0]
 
 
 def test_looking_changes_nothing_and_finishing_keeps_the_best(
@@ -297,26 +299,26 @@ def test_looking_changes_nothing_and_finishing_keeps_the_best(
     part(fit, FewShown).best(fit)
     assert all(torch.equal(value, before[name]) for name, value in fit.model.state_dict().items())
     # Offsets as they were learnt are made to be the best.
-    kept = weigh_evidence(
-        part(fit, FewShown).shown, len(fit.data.frames), strengths(fit.settings.evidence)[3]
+    kept = weigh_visibility(
+        part(fit, FewShown).shown, len(fit.data.frames), strengths(fit.settings.visibility)[3]
     )
     monkeypatch.setattr(FewShown, "best", lambda choice, fit: [kept])
     fit.finish(0, 0.0)
     frame = int(training.validation[0])
     where = training.hand_poses(frame), training.camera(frame)
     drawn = fit.avatar(0).render(*where)
-    fit.model.evidence = weigh_evidence(
-        part(fit, FewShown).shown, len(fit.data.frames), fit.settings.evidence
+    fit.model.visibility = weigh_visibility(
+        part(fit, FewShown).shown, len(fit.data.frames), fit.settings.visibility
     )
     assert np.abs(fit.avatar(0).render(*where) - drawn).max() > 0.01
-    fit.model.evidence = kept
+    fit.model.visibility = kept
     np.testing.assert_allclose(fit.avatar(0).render(*where), drawn, atol=1e-6)
     again = load_avatar(save_avatar(fit.avatar(0), tmp_path / "avatar"))
     np.testing.assert_allclose(again.render(*where), drawn, atol=1e-6)
 
 
 @pytest.mark.parametrize(
-    "changes", [{"validated": False}, {"evidence.enabled": False}, {"mode": "paper"}]
+    "changes", [{"validated": False}, {"visibility.enabled": False}, {"mode": "paper"}]
 )
 def test_nothing_is_chosen_where_it_is_off(
     changes: dict[str, Any], training: TrainingCapture, monkeypatch: pytest.MonkeyPatch
@@ -326,7 +328,7 @@ def test_nothing_is_chosen_where_it_is_off(
         changes = {}
     fit = begun(training, **changes)
     choice = fit.part(FewShown)
-    assert (choice is not None) == fit.settings.evidence.enabled
+    assert (choice is not None) == fit.settings.visibility.enabled
     if choice is None:
         return
     assert choice.judges is None

@@ -1,9 +1,9 @@
 """Gaussians that few frames have shown: discs on the skin, as far as validation frames agree.
 
 Where a person's hand is far from the hand model, offsets from the skin are the person's and not
-errors of depth, and evidence takes away what is right. Where a palm has another colour than the
+errors of depth, and visibility takes away what is right. Where a palm has another colour than the
 back, as that of a glove, the back says nothing of it. Nothing in the training frames tells: they
-are drawn without evidence, and show other places.
+are drawn without visibility, and show other places.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ import torch
 from torch import Tensor
 
 from hwp_bench.base.arrays import evenly
-from wildghand.evidence import (
-    ColorChanges,
-    Evidence,
-    EvidenceSettings,
-    fill_shares,
-    shown_frames,
-    strengths,
-    weigh_evidence,
-)
 from wildghand.fitting.choice import JudgedDrawings, ValidationFrames, choose
 from wildghand.fitting.colors import FilledColors
 from wildghand.fitting.fit import Component, Fit
 from wildghand.gaussians.training import TrainingClip
 from wildghand.model.model import WildGHandModel
+from wildghand.visibility import (
+    ColorChanges,
+    Visibility,
+    VisibilitySettings,
+    fill_shares,
+    shown_frames,
+    strengths,
+    weigh_visibility,
+)
 
 # Most training frames in which gaps are looked for.
 _FRAMES = 12
@@ -50,7 +50,7 @@ class Gaps:
     Gaussians that left the skin to close such a place are right, however few frames show them.
     """
 
-    #: What is drawn; its evidence is put back.
+    #: What is drawn; its visibility is put back.
     model: WildGHandModel
     #: Hands and cameras of the training frames.
     clip: TrainingClip
@@ -59,21 +59,21 @@ class Gaps:
     #: Training frames.
     count: int
 
-    def closers(self, evidence: Evidence) -> dict[str, Tensor]:
-        """Find the Gaussians that close what evidence would open.
+    def closers(self, visibility: Visibility) -> dict[str, Tensor]:
+        """Find the Gaussians that close what visibility would open.
 
         Returns:
             (N,) bool by side.
         """
         drawn = self._nothing()
         for row in evenly(self.count, _FRAMES).tolist():
-            self._add(drawn, row, evidence)
+            self._add(drawn, row, visibility)
         return {side: sums[:, 0] > _SPARED * sums[:, 1] for side, sums in drawn.items()}
 
-    def seconds(self, evidence: Evidence) -> float:
+    def seconds(self, visibility: Visibility) -> float:
         """Return about how long `closers` takes; nothing of the model changes."""
         begun = time.perf_counter()
-        self._add(self._nothing(), 0, evidence)
+        self._add(self._nothing(), 0, visibility)
         return min(self.count, _FRAMES) * (time.perf_counter() - begun)
 
     def _nothing(self) -> dict[str, Tensor]:
@@ -81,13 +81,13 @@ class Gaps:
         zeros = self.model.log_gains.new_zeros
         return {side: zeros(len(rig), 2) for side, rig in self.model.rigs.items()}
 
-    def _add(self, drawn: Mapping[str, Tensor], row: int, evidence: Evidence) -> None:
+    def _add(self, drawn: Mapping[str, Tensor], row: int, visibility: Visibility) -> None:
         """Add what each Gaussian draws in a frame."""
         rows = torch.tensor([row])
         visible = self.visible(rows)
         colors, image, closed = self._draw(rows, visible.shape, None)
         with torch.no_grad():
-            left = self._draw(rows, visible.shape, evidence)[-1]
+            left = self._draw(rows, visible.shape, visibility)[-1]
             opened = (closed - left - _GAP).clamp(min=0.0)[..., 0] * visible
         # What a Gaussian weighs in a pixel is the slope of the pixel by the Gaussian's colour.
         pixels = (opened * image[..., 0] + image[..., 1]).sum()
@@ -96,12 +96,12 @@ class Gaps:
             drawn[side].add_(slope[0, :, :2])
 
     def _draw(
-        self, rows: Tensor, shape: torch.Size, evidence: Evidence | None
+        self, rows: Tensor, shape: torch.Size, visibility: Visibility | None
     ) -> tuple[dict[str, Tensor], Tensor, Tensor]:
         """Draw a frame free of perturbations: colours by side, image and coverage."""
         model, here = self.model, rows.to(self.model.log_gains.device)
-        colors, found, before = {}, {}, model.evidence
-        model.evidence = evidence
+        colors, found, before = {}, {}, model.visibility
+        model.visibility = visibility
         try:
             for side, (pose, betas, transl) in self.clip.parameters.items():
                 with torch.no_grad():
@@ -109,7 +109,7 @@ class Gaps:
                 colors[side] = made.colors.detach().clone().requires_grad_()
                 found[side] = replace(made, colors=colors[side]), hand
         finally:
-            model.evidence = before
+            model.visibility = before
         size = shape[-1], shape[-2]
         image, coverage = model.rasterize(
             found, self.clip.viewmats[here], self.clip.Ks[here], *size
@@ -118,7 +118,7 @@ class Gaps:
 
 
 class FewShown(Component):
-    """Evidence counts before the fit; how strongly it acts, and fill, is chosen after it.
+    """Visibility counts before the fit; how strongly it acts, and fill, is chosen after it.
 
     Attributes:
         shown: (N,) by side, how many training frames show each Gaussian.
@@ -133,10 +133,10 @@ class FewShown(Component):
     judges: JudgedDrawings | None
 
     def before(self, fit: Fit) -> None:
-        """Count, and let the model keep the evidence of the settings' own strength."""
+        """Count, and let the model keep the visibility of the settings' own strength."""
         data, model, count = fit.data, fit.model, len(fit.data.frames)
         self.shown = shown_frames(model.rigs, fit.clip, data.visible, count)
-        model.keep(weigh_evidence(self.shown, count, fit.settings.evidence))
+        model.keep(weigh_visibility(self.shown, count, fit.settings.visibility))
         self.gaps = Gaps(model, fit.clip, data.visible, count)
         self.filled = FilledColors(fit, self.shown)
         frames = fit.part(ValidationFrames)
@@ -147,37 +147,39 @@ class FewShown(Component):
         for best in self.best(fit):
             fit.model.keep(best)
 
-    def best(self, fit: Fit) -> list[Evidence | ColorChanges]:
+    def best(self, fit: Fit) -> list[Visibility | ColorChanges]:
         """What draws validation frames best; without what is the model's own already.
 
-        Where nothing is judged, that is evidence and fill by the settings' own shares. In each case
+        Where nothing is judged, these are the shares of the settings. In each case
         Gaussians that close gaps are spared.
         """
-        several, shares = self.candidates(fit), fill_shares(fit.settings.evidence)
+        several, shares = self.candidates(fit), fill_shares(fit.settings.visibility)
         if self.judges is None:
-            evidence, (colors,) = several[0], self.filled.carried_on(shares[:1])
+            visibility, (colors,) = several[0], self.filled.carried_on(shares[:1])
         else:
-            evidence, colors = self._judged(fit, self.judges, several)
-        found: list[Evidence | ColorChanges] = []
-        if not evidence.equals(fit.model.evidence):
-            found.append(evidence)
+            visibility, colors = self._judged(fit, self.judges, several)
+        found: list[Visibility | ColorChanges] = []
+        if not visibility.equals(fit.model.visibility):
+            found.append(visibility)
         if colors is not None:
             found.append(colors)
         return found
 
-    def candidates(self, fit: Fit) -> list[Evidence]:
+    def candidates(self, fit: Fit) -> list[Visibility]:
         """The strengths, the settings' own first; Gaussians that close gaps are spared in each."""
         closers = self.gaps.closers(self._strongest(fit))
-        return [self._weigh(fit, each).spare(closers) for each in strengths(fit.settings.evidence)]
+        return [
+            self._weigh(fit, each).spare(closers) for each in strengths(fit.settings.visibility)
+        ]
 
     def _judged(
-        self, fit: Fit, judges: JudgedDrawings, several: Sequence[Evidence]
-    ) -> tuple[Evidence, ColorChanges | None]:
-        """One evidence of several, and with it the changes of colours."""
+        self, fit: Fit, judges: JudgedDrawings, several: Sequence[Visibility]
+    ) -> tuple[Visibility, ColorChanges | None]:
+        """One visibility of several, and with it the changes of colours."""
         predicted, opened = judges.predict_all(), frozenset(fit.model.rigs)
 
-        def error(evidence: Evidence) -> float:
-            return judges.error(predicted, evidence, None)
+        def error(visibility: Visibility) -> float:
+            return judges.error(predicted, visibility, None)
 
         # Of equal ones the first is taken, which is the settings' own.
         best, least = choose([(each, 0.0) for each in several], error)
@@ -189,7 +191,7 @@ class FewShown(Component):
         best, _ = choose(others, error, (best, least))
         if fit.model.light is None:
             return best, None
-        fills = self.filled.carried_on(fill_shares(fit.settings.evidence))
+        fills = self.filled.carried_on(fill_shares(fit.settings.visibility))
         several_fills = [(each, 0.0) for each in fills]
         colors, _ = choose(several_fills, lambda each: judges.error(predicted, best, each))
         return best, colors
@@ -197,7 +199,7 @@ class FewShown(Component):
     def seconds(self, fit: Fit) -> float:
         """See `Component`."""
         total = self.gaps.seconds(self._strongest(fit))
-        settings, lit = fit.settings.evidence, fit.settings.light.enabled
+        settings, lit = fit.settings.visibility, fit.settings.light.enabled
         fills = fill_shares(settings)
         if self.judges is not None:
             took = self.judges.seconds
@@ -212,10 +214,10 @@ class FewShown(Component):
             total += (time.perf_counter() - begun) * sum(share > 0.0 for share in fills)
         return total
 
-    def _strongest(self, fit: Fit) -> Evidence:
+    def _strongest(self, fit: Fit) -> Visibility:
         """What opens the most."""
-        several = strengths(fit.settings.evidence)
+        several = strengths(fit.settings.visibility)
         return self._weigh(fit, max(several, key=lambda each: each.offset_share))
 
-    def _weigh(self, fit: Fit, settings: EvidenceSettings) -> Evidence:
-        return weigh_evidence(self.shown, len(fit.data.frames), settings)
+    def _weigh(self, fit: Fit, settings: VisibilitySettings) -> Visibility:
+        return weigh_visibility(self.shown, len(fit.data.frames), settings)
