@@ -16,7 +16,7 @@ import tempfile
 import threading
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, cast
@@ -103,38 +103,28 @@ class _Run:
         self._ray, self._view, self._jobs, self._on_done = ray, view, jobs, on_done
         self._shared = shared
         self._toolkit = toolkit_digest()
-        self._finished = [job.finished() for job in jobs]
-        unfinished = [job for job, done in zip(jobs, self._finished, strict=True) if not done]
-        folders = {folder for job in unfinished for folder in job.inputs.values()}
-        self._digests = {folder: folder_digest(folder.path, folder.skip) for folder in folders}
-        # Of each job that waits: its index by Ray's reference; and its place.
+        self._digests: dict[Folder, str] = {}
+        self._sent: dict[Folder, Any] = {}
+        # Of each job that waits: its index by Ray's reference, the number of its order, its place.
         self._pending: dict[Any, int] = {}
+        self._numbers: dict[int, int] = {}
         self._places: dict[int, str] = {}
+        self._orders = 0
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-        # On the node that orders the jobs, where the folders are, and so that no lost node takes
-        # the board along.
+        # On the node that orders the jobs, so that no lost node takes the board along.
         here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=True)
-        # Where Ray puts it on another node after all, it begins again: jobs cannot do without it.
-        board = ray.remote(Board).options(
-            num_cpus=0, scheduling_strategy=here, max_restarts=-1, max_task_retries=-1
-        )
-        self._board = board.remote(
-            {
-                digest: replace(folder, path=folder.path.absolute())
-                for folder, digest in self._digests.items()
-            }
-        )
+        self._board = ray.remote(Board).options(num_cpus=0, scheduling_strategy=here).remote()
         self._news: Any = self._board.read.remote()
 
     def all(self) -> None:
         failures: list[HwpError] = []
         try:
-            for index, finished in enumerate(self._finished):
-                if finished:
+            for index, job in enumerate(self._jobs):
+                if job.finished():
                     self._end(index)
                 else:
-                    self._submit(index)
+                    self._submit(index, ())
             self._say_if_none_fits()
             while self._pending:
                 ready, _ = self._ray.wait(list(self._pending), timeout=LOOK_SECONDS)
@@ -153,7 +143,7 @@ class _Run:
     def _take(self, index: int, reference: Any) -> None:
         job = self._jobs[index]
         try:
-            reply: Parcel | Mapping[str, str | None] = self._ray.get(reference)
+            reply: Reply = self._ray.get(reference)
         except self._ray.exceptions.RayTaskError as error:
             reason = str(error).strip().splitlines()[-1][:300]
             raise HwpError(
@@ -162,20 +152,27 @@ class _Run:
             ) from error
         except self._ray.exceptions.RayError as error:
             raise lost_error(job.text, type(error).__name__) from error
-        if not isinstance(reply, Parcel):
-            raise parse_error(reply)
-        unpack(reply, job.output, replace=True)
-        self._end(index)
+        if reply.missing:
+            self._places.pop(index, None)
+            self._view.drop(index)
+            self._submit(index, reply.missing)
+        elif reply.result is None:
+            raise parse_error(reply.failure)
+        else:
+            unpack(reply.result, job.output, replace=True)
+            self._end(index)
 
     def _end(self, index: int) -> None:
         self._view.end(index, self._jobs[index].text)
         self._on_done(index)
 
-    def _submit(self, index: int) -> None:
+    def _submit(self, index: int, send: Sequence[str]) -> None:
+        """Hand a job to Ray, with the inputs that its node did not have."""
         job = self._jobs[index]
+        sent = {name: [self._parcel(job.inputs[name])] for name in send}
         inputs = {
             name: Input(
-                self._digests[folder],
+                self._digest(folder),
                 str(folder.path.absolute()) if self._shared else None,
                 folder.skip,
             )
@@ -184,14 +181,30 @@ class _Run:
         environment = thread_environment(job.needs)
         if job.needs.gpus == 0:
             environment[VISIBLE_GPUS] = ""
+        # Ray starts an order again by itself; a new number is an order that it never had.
+        number = self._numbers[index] = self._orders
+        self._orders += 1
+        order = Order(number, job.work, inputs, environment, self._toolkit)
         task = self._ray.remote(run_order).options(
             name=job.text,
             num_cpus=job.needs.cpus,
             num_gpus=job.needs.gpus,
             max_retries=RETRIES,
         )
-        order = Order(index, job.work, inputs, environment, self._toolkit)
-        self._pending[task.remote(order, self._board)] = index
+        self._pending[task.remote(order, sent, self._board)] = index
+
+    def _digest(self, folder: Folder) -> str:
+        if folder not in self._digests:
+            self._digests[folder] = folder_digest(folder.path, folder.skip)
+        return self._digests[folder]
+
+    def _parcel(self, folder: Folder) -> Any:
+        """Put a folder into Ray's store, once; from then on its digest is that of what was put."""
+        if folder not in self._sent:
+            parcel = pack(folder.path, folder.skip)
+            self._digests[folder] = parcel.digest
+            self._sent[folder] = self._ray.put(parcel)
+        return self._sent[folder]
 
     def _show(self) -> None:
         # Asked for before, read when it is there: jobs do not wait for the news.
@@ -203,7 +216,7 @@ class _Run:
             last = self._ray.get(self._news)
         self._news = self._board.read.remote()
         for index in self._pending.values():
-            place, done, total = last.get(index, ("", 0, 0))
+            place, done, total = last.get(self._numbers[index], ("", 0, 0))
             if place and self._places.get(index) != place:
                 self._places[index] = place
                 self._view.start(index, self._jobs[index].text, place)
@@ -333,14 +346,25 @@ class Input:
 class Order:
     """A job on its way to a node."""
 
-    #: Index of the job.
-    index: int
+    #: Number of this order; a job that is ordered again gets a new one.
+    number: int
     work: Work
     #: The folders that it reads, by name.
     inputs: Mapping[str, Input]
     environment: Mapping[str, str]
     #: Digest of the toolkit that ordered it.
     toolkit: str
+
+
+@dataclass(frozen=True)
+class Reply:
+    """The answer of a node: a result, or the names of missing inputs, or an error."""
+
+    result: Parcel | None = None
+    #: Names of inputs that must be sent.
+    missing: tuple[str, ...] = ()
+    #: Kind, problem, where, field and remedy of an error.
+    failure: Mapping[str, str | None] = field(default_factory=dict)
 
 
 def toolkit_digest() -> str:
@@ -351,12 +375,12 @@ def toolkit_digest() -> str:
 
 
 @flushed()
-def run_order(order: Order, board: Any) -> Parcel | dict[str, str | None]:
-    """Do a job on this node; returns its result, or the record of its error."""
+def run_order(order: Order, sent: Mapping[str, list[Any]], board: Any) -> Reply:
+    """Do a job on this node."""
     import ray
 
     place = f"{socket.gethostname()}/{ray.get_runtime_context().get_node_id()[:6]}"
-    tell = partial(board.update.remote, order.index, place)
+    tell = partial(board.update.remote, order.number, place)
     tell(0, 0)
     try:
         if toolkit_digest() != order.toolkit:
@@ -365,27 +389,37 @@ def run_order(order: Order, board: Any) -> Parcel | dict[str, str | None]:
                 where=place,
                 remedy="Install the same version on every node.",
             )
-        inputs = {name: _find(one, name, board) for name, one in order.inputs.items()}
-        return _run(order, inputs, tell)
+        inputs, missing = _find_inputs(order, sent)
+        if missing:
+            return Reply(missing=missing)
+        return Reply(result=_run(order, inputs, tell))
     except HwpError as error:
-        return error_record(error)
+        return Reply(failure=error_record(error))
 
 
-def _find(ordered: Input, name: str, board: Any) -> Path:
-    """Return where an input lies on this node; what is not here is fetched."""
+def _find_inputs(
+    order: Order, sent: Mapping[str, list[Any]]
+) -> tuple[dict[str, Path], tuple[str, ...]]:
+    """Return where inputs lie on this node, and which must be sent."""
     import ray
 
-    cached = cache_root() / "engine" / "inputs" / ordered.digest
-    if cached.is_dir():
-        return cached
-    if _is_shared(ordered):
-        return Path(str(ordered.path))
-    [reference] = ray.get(board.fetch.remote(ordered.digest))
-    parcel = ray.get(reference)
-    if parcel.digest != ordered.digest:
-        raise BadInput("another folder was sent than the one that was ordered", field=name)
-    unpack(parcel, cached)
-    return cached
+    found: dict[str, Path] = {}
+    missing = []
+    for name, ordered in order.inputs.items():
+        cached = cache_root() / "engine" / "inputs" / ordered.digest
+        if cached.is_dir():
+            found[name] = cached
+        elif _is_shared(ordered):
+            found[name] = Path(str(ordered.path))
+        elif name in sent:
+            parcel = ray.get(sent[name][0])
+            if parcel.digest != ordered.digest:
+                raise BadInput("another folder was sent than the one that was ordered", field=name)
+            unpack(parcel, cached)
+            found[name] = cached
+        else:
+            missing.append(name)
+    return found, tuple(missing)
 
 
 def _is_shared(ordered: Input) -> bool:
@@ -415,25 +449,14 @@ def _run(order: Order, inputs: Mapping[str, Path], tell: Any) -> Parcel:
 
 
 class Board:
-    """Knows the folders of jobs and the last news of each; lives where the jobs are ordered."""
+    """The last news of every order; lives on the node that gave the orders."""
 
-    def __init__(self, folders: Mapping[str, Folder]) -> None:
-        self._folders = folders
-        self._sent: dict[str, Any] = {}
+    def __init__(self) -> None:
         self._last: dict[int, tuple[str, int, int]] = {}
 
-    def fetch(self, digest: str) -> list[Any]:
-        """Put the folder of a digest into Ray's store, once; returns the reference, in a list."""
-        import ray
-
-        if digest not in self._sent:
-            folder = self._folders[digest]
-            self._sent[digest] = ray.put(pack(folder.path, folder.skip))
-        return [self._sent[digest]]
-
-    def update(self, index: int, place: str, done: int, total: int) -> None:
+    def update(self, number: int, place: str, done: int, total: int) -> None:
         """Note how far an order is."""
-        self._last[index] = (place, done, total)
+        self._last[number] = (place, done, total)
 
     def read(self) -> dict[int, tuple[str, int, int]]:
         """Return (place, done, total) by number."""
