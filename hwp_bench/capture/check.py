@@ -30,7 +30,7 @@ from hwp_bench.capture.schema import (
     numbers_digests,
 )
 from hwp_bench.capture.writer import combine
-from hwp_bench.hands.raster import draw_bones
+from hwp_bench.hands.skeleton import draw_bones
 from hwp_bench.hands.template import HandTemplate
 from hwp_bench.taxonomy import perturbation
 

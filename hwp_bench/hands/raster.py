@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 
 from hwp_bench.base.kernels import compiled
-from hwp_bench.hands.skeleton import LANDMARK_EDGES
 
 # Faces with a corner nearer to the camera than this, m, are left out.
 _NEAR = 1e-3
@@ -76,15 +75,6 @@ def fixed_point(pixels: np.ndarray) -> tuple[list[tuple[int, int]], int]:
     """
     scaled = np.nan_to_num((pixels - 0.5) * 2**_SHIFT, nan=_FAR)
     return [(x, y) for x, y in np.clip(scaled, -_FAR, _FAR).round().astype(int).tolist()], _SHIFT
-
-
-def draw_bones(canvas: np.ndarray, landmarks: np.ndarray, colour: tuple[int, int, int]) -> None:
-    """Draw the bones between 21 landmarks, (21, 2) px, into an image (H, W, 3) uint8."""
-    import cv2
-
-    places, shift = fixed_point(landmarks)
-    for first, last in LANDMARK_EDGES:
-        cv2.line(canvas, places[first], places[last], colour, 1, cv2.LINE_AA, shift)
 
 
 def draw_dots(

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hwp_bench.base.errors import BadHandModel, BadInput
+from hwp_bench.hands.raster import fixed_point
 
 #: Joint names in MANO's order, which every template here uses.
 JOINT_NAMES = (
@@ -182,3 +183,12 @@ class Camera:
     width: int
     #: Image height, px.
     height: int
+
+
+def draw_bones(canvas: np.ndarray, landmarks: np.ndarray, colour: tuple[int, int, int]) -> None:
+    """Draw the bones between 21 landmarks, (21, 2) px, into an image (H, W, 3) uint8."""
+    import cv2
+
+    places, shift = fixed_point(landmarks)
+    for first, last in LANDMARK_EDGES:
+        cv2.line(canvas, places[first], places[last], colour, 1, cv2.LINE_AA, shift)

@@ -15,7 +15,8 @@ import numpy as np
 from hwp_bench.base.console import progress
 from hwp_bench.base.drawing import labelled, sheet
 from hwp_bench.base.errors import HwpError, UsageError
-from hwp_bench.hands.raster import draw_bones, draw_dots
+from hwp_bench.hands.raster import draw_dots
+from hwp_bench.hands.skeleton import draw_bones
 from hwp_bench.importers.shared.landmarks import HandTracks, write_hand_tracks
 from hwp_bench.importers.video.decode import (
     FrameRange,

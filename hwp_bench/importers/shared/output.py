@@ -21,7 +21,8 @@ from hwp_bench.base.files import refuse_existing as refuse_folder
 from hwp_bench.capture import Cameras, CaptureInfo, CaptureWriter, identify_hand_model
 from hwp_bench.hands import HandParameters, HandTemplate, project
 from hwp_bench.hands.fitting import FitTargets, FittedHand, fit_hand
-from hwp_bench.hands.raster import draw_bones, draw_dots, fixed_point
+from hwp_bench.hands.raster import draw_dots, fixed_point
+from hwp_bench.hands.skeleton import draw_bones
 from hwp_bench.hands.skinning import pose_parameters
 from hwp_bench.importers.shared.frames import each_frame
 
