@@ -160,7 +160,7 @@ class SharedFeatures:
     Args:
         network: it predicts the features.
         every: steps of a block; 1: nothing is shared.
-        terms: of the loss that no frame enters, see `Objective.of_features`.
+        terms: of the loss that no frame enters, see `Component.loss_of_features`.
 
     Attributes:
         value: of these terms at the start of the block, without gradient.
