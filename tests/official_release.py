@@ -140,7 +140,7 @@ def write_pickles(folder: Path, rows: list[dict[str, Any]], pickles: int = 1) ->
 def write_rendered(
     experiment: Path, capture: Capture, frames: list[int], size: int | None = None
 ) -> Path:
-    """What the authors' code leaves of a test run: the truth at half its brightness; returns `render`."""
+    """What the authors' code leaves of a test run, drawn at half the truth; returns `render`."""
     place = experiment / "images_all" / "-1" / "render"
     place.mkdir(parents=True)
     for frame in frames:

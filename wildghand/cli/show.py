@@ -138,10 +138,13 @@ _EXPORT_EXAMPLES = """examples:
   wildghand export my_avatar -o hand.ply --supersplat
   wildghand export my_avatar -o splats.glb
   wildghand export my_avatar -o hand.glb --mesh --poses my_capture
+  wildghand export frame649.pth -o hand.ply      # Gaussians that the authors' code has made
 
 The extension decides the format: .ply, Gaussians in the layout of 3DGS; .spz, the same in a tenth
 of the size; .glb, Gaussians as glTF (KHR_gaussian_splatting, a release candidate), or with --mesh
-a skinned mesh with 16 joints a hand, a texture and a motion. Lengths are metres.
+a skinned mesh with 16 joints a hand, a texture and a motion. Lengths are metres. In place of an
+avatar's folder a file (.pth, .ckpt) may stand with the Gaussians of one pose, as the authors' code
+makes them; docs/export.md says how it is saved.
 """
 
 
@@ -171,7 +174,7 @@ def add_export(parser: argparse.ArgumentParser) -> None:
 
 def do_export(args: argparse.Namespace) -> int:
     """Run the command."""
-    from wildghand.export.formats import ExportSettings, check_target, export
+    from wildghand.export.formats import ExportSettings, check_target, export, export_gaussians
 
     names = (item.name for item in dataclasses.fields(ExportSettings))
     settings = ExportSettings(**{name: getattr(args, name) for name in names})
@@ -180,11 +183,20 @@ def do_export(args: argparse.Namespace) -> int:
     if args.frame is not None and (args.poses is None or args.mesh):
         raise UsageError("needs --poses, and no --mesh", field="--frame")
 
-    from hwp_bench.capture import open_capture
+    counts: dict[str, int]
+    if args.avatar.is_file():
+        if args.poses is not None:
+            raise UsageError("needs an avatar, not Gaussians of one pose", field="--poses")
+        from wildghand.export.official import read_official_gaussians
 
-    capture = None if args.poses is None else open_capture(args.poses)
-    more: dict[str, Any] = {"capture": capture, "frame": args.frame, "overwrite": args.overwrite}
-    counts = export(avatar_of(args), args.out, settings, **more)
+        splats = read_official_gaussians(args.avatar)
+        counts = export_gaussians(splats, args.out, settings, overwrite=args.overwrite)
+    else:
+        from hwp_bench.capture import open_capture
+
+        capture = None if args.poses is None else open_capture(args.poses)
+        more: dict[str, Any] = {"frame": args.frame, "overwrite": args.overwrite}
+        counts = export(avatar_of(args), args.out, settings, capture=capture, **more)
     if args.json:
         print_json({"file": str(args.out), **counts})
     else:

@@ -73,8 +73,8 @@ class RenderedImport:
             found.append(f"drawn with alpha, laid over black: frames {bounded(self.with_alpha)}")
         if self.other_background:
             found.append(
-                "the background is not black, and shows through where the hand is not opaque: frames "
-                f"{bounded(self.other_background)}"
+                "the background is not black, and shows through where the hand is not opaque: "
+                f"frames {bounded(self.other_background)}"
             )
         if self.truth_db is not None and self.truth_db < SAME_CROP:
             found.append(
