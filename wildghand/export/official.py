@@ -1,6 +1,6 @@
 """The Gaussians that the authors' code draws in one pose.
 
-Their checkpoints (`.ckpt`) hold the weights of a network and no Gaussians: it makes Gaussians anew
+Their checkpoints (`.ckpt`) hold the weights of a network and no Gaussians: it makes Gaussians again
 for every pose, as a named tuple (`out["3dgs_input"][0]` in their test step). What is read here is
 that tuple, saved with `torch.save(out["3dgs_input"][0]._asdict(), "frame649.pth")`.
 """
@@ -62,10 +62,10 @@ def read_official_gaussians(path: str | os.PathLike[str]) -> PosedGaussians:
     }
     lengths = np.linalg.norm(arrays["rotation"], axis=1, keepdims=True)
     for name, bad, problem in (
-        ("rotation", lengths[:, 0] < 1e-6, "is no rotation"),
+        ("rotation", lengths[:, 0] < 1e-6, "has length 0"),
         ("scaling", (arrays["scaling"] <= 0.0).any(axis=1), "is not above 0"),
         ("opacity", arrays["opacity"][:, 0] < 0.0, "is below 0"),
-        ("shs", (arrays["shs"] < 0.0).any(axis=(1, 2)), "is no colour in [0, 1]"),
+        ("shs", (arrays["shs"] < 0.0).any(axis=(1, 2)), "is below 0"),
     ):
         if bad.any():
             raise BadInput(f"{problem} in row {int(bad.argmax())}", where=path, field=name)

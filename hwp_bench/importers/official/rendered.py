@@ -60,11 +60,11 @@ class RenderedImport:
     #: Frames whose background is not black.
     other_background: list[int] = field(default_factory=list)
     #: Mean PSNR between their ground truth and the capture's frames on the scored mask, dB; None
-    #: where no ground truth lies beside the drawings.
+    #: where no ground truth lies next to the drawings.
     truth_db: float | None = None
 
     def warnings(self) -> list[str]:
-        """What a person should know before the scores are believed, as sentences."""
+        """Return the sentences that a person should read before believing the scores."""
         found = []
         if self.missing:
             found.append(f"test frames without a drawing get the penalty: {bounded(self.missing)}")

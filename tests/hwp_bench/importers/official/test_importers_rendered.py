@@ -47,7 +47,7 @@ def test_drawings_are_scored_as_the_same_pixels_submitted(
     assert take(tmp_path / "c0_single", capture, out) == 0
     told = capsys.readouterr()
     assert "2 of 2 test frames of capture0" in told.out
-    # The ground truth beside the drawings is the capture's own frame: the cap of PSNR.
+    # The ground truth next to the drawings is the capture's own frame: the cap of PSNR.
     assert "their ground truth: 100.0 dB" in told.out
     assert "warning" not in told.err
     for frame in TEST:
