@@ -204,6 +204,49 @@ def do_export(args: argparse.Namespace) -> int:
     return 0
 
 
+_STAGE_EXAMPLES = """examples:
+  wildghand stage my_avatar --poses my_capture
+  wildghand stage my_avatar --poses my_capture --frame 30 -o side.png
+
+Draws the Gaussians of one frame as ellipsoids and the cameras of the clip in 3D, seen from the
+side: the camera of the frame is red, others are grey. It needs no display.
+"""
+
+
+def add_stage(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.epilog = _STAGE_EXAMPLES
+    add_avatar(parser)
+    add_poses(parser, "capture with the pose and the cameras (default: what a fit of a video left)")
+    add, out = parser.add_argument, Path("stage.png")
+    add("--frame", type=int, default=0, help="its frame (default: 0)")
+    text = "image to write (default: stage.png)"
+    add("-o", "--out", type=Path, default=out, metavar="FILE", help=text)
+    add_ending(parser, "file")
+
+
+def do_stage(args: argparse.Namespace) -> int:
+    """Run the command."""
+    from hwp_bench.capture import open_capture
+    from wildghand.viewer.posed_view import capture_of
+    from wildghand.viewer.stage import draw_stage
+
+    check_places({"--out": args.out}, {"AVATAR": args.avatar, "--poses": args.poses})
+    if args.out.suffix.lower() not in (".png", ".jpg"):
+        raise UsageError("has another ending than .png or .jpg", where=args.out, field="--out")
+    if args.out.exists() and not args.overwrite:
+        raise UsageError("exists", where=args.out, remedy="Give --overwrite to replace it.")
+    poses = args.poses or capture_of(args.avatar)
+    if poses is None:
+        raise UsageError("is missing", field="--poses", remedy="Name the capture that was fitted.")
+    count = draw_stage(avatar_of(args), open_capture(poses), args.frame, args.out)
+    if args.json:
+        print_json({"file": str(args.out), "gaussians": count})
+    else:
+        print(f"{args.out}: {count} Gaussians")
+    return 0
+
+
 _PAGE_EXAMPLES = """examples:
   wildghand page my_avatar
   wildghand page my_avatar --poses my_capture -o hand.html
@@ -256,4 +299,5 @@ COMMANDS = {
     "view": (add_view, do_view),
     "export": (add_export, do_export),
     "page": (add_page, do_page),
+    "stage": (add_stage, do_stage),
 }
