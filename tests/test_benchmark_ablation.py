@@ -76,7 +76,7 @@ def test_what_is_not_there_is_said_and_not_counted(tmp_path: Path) -> None:
     assert "- smoke, cross: seed 1: 1 of 2 captures in all variants." in page
     assert "seed 1: 0 of 2 captures in all variants. Nothing of this part is shown." in page
     assert "Seeds: 0. " in page
-    assert "This study has no part in these modes." in page
+    assert "Nothing of these modes is there." in page
 
 
 def test_a_seed_that_is_not_whole_counts_where_there_is_no_other(tmp_path: Path) -> None:
