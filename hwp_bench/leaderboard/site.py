@@ -294,8 +294,8 @@ def curve_plot(rows: Sequence[BoardRow]) -> dict[str, Any] | None:
 
     Returns:
         The plot (`figure`), the labels of the methods in the order of their colours (`methods`),
-        of those on the Pareto front for some time (`front`), and what the bands are (`bands`). None where no whole row left a
-        curve, or where one submitted twice cannot be told apart.
+        of those on the Pareto front for some time (`front`), and what the bands are (`bands`).
+        None where no whole row left a curve, or where one submitted twice cannot be told apart.
     """
     whole = sorted((row for row in rows if row.whole), key=lambda row: -row.scores[METRIC])
     try:
