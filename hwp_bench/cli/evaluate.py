@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from hwp_bench.commitments import SealedPart
     from hwp_bench.evaluation.ablate.runs import AblationRuns
     from hwp_bench.evaluation.budget.budget import BudgetRuns
-    from hwp_bench.evaluation.evaluate import EvaluationSettings, OnCapture
+    from hwp_bench.evaluation.capture_evaluation import EvaluationSettings
+    from hwp_bench.evaluation.evaluate import OnCapture
     from hwp_bench.methods.manifest import MethodManifest
     from hwp_bench.results import Results
 
@@ -199,7 +200,7 @@ def _notice_failures(folder: Path, results: Results, head: str = "") -> int:
 
 def _evaluation_settings(args: argparse.Namespace) -> EvaluationSettings:
     """Return the settings that `_add_evaluation` and `--seed` gave."""
-    from hwp_bench.evaluation.evaluate import EvaluationSettings
+    from hwp_bench.evaluation.capture_evaluation import EvaluationSettings
     from hwp_bench.methods.contract import Budget, RunSettings
     from hwp_bench.run.sandbox.confinement import Confinement
 
@@ -443,13 +444,8 @@ def _add_demo(parser: argparse.ArgumentParser) -> None:
 def _demo(args: argparse.Namespace) -> int:
     from hwp_bench.capture import open_capture
     from hwp_bench.evaluation.artifacts import write_side_by_side
-    from hwp_bench.evaluation.evaluate import (
-        EvaluationSettings,
-        check_call,
-        check_results_place,
-        check_suite,
-        evaluate,
-    )
+    from hwp_bench.evaluation.capture_evaluation import EvaluationSettings
+    from hwp_bench.evaluation.evaluate import check_call, check_results_place, check_suite, evaluate
     from hwp_bench.methods import find_method, read_manifest
     from hwp_bench.report.sources import ResultsSource
     from hwp_bench.report.tables import all_tables

@@ -12,14 +12,8 @@ from hwp_bench.analysis.pairing import MethodRuns
 from hwp_bench.base.errors import UsageError, did_you_mean
 from hwp_bench.capture.splits import Split
 from hwp_bench.commitments.publication import open_captures
-from hwp_bench.evaluation.evaluate import (
-    EvaluationSettings,
-    How,
-    OnCapture,
-    make_plan,
-    run_plans,
-    with_setting_files,
-)
+from hwp_bench.evaluation.capture_evaluation import EvaluationSettings
+from hwp_bench.evaluation.evaluate import How, OnCapture, make_plan, run_plans, with_setting_files
 from hwp_bench.methods.manifest import MANIFEST, Base, MethodManifest, Switch
 from hwp_bench.metrics.lpips import load_available
 from hwp_bench.results import Results

@@ -16,7 +16,8 @@ from hwp_bench.base.images import write_image
 from hwp_bench.capture import Capture
 from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.cli.main import main
-from hwp_bench.evaluation.evaluate import EvaluationSettings, default_folder, evaluate
+from hwp_bench.evaluation.capture_evaluation import EvaluationSettings
+from hwp_bench.evaluation.evaluate import default_folder, evaluate
 from hwp_bench.methods.contract import Budget, RunSettings
 from hwp_bench.metrics import METRICS, metric, penalty
 from hwp_bench.results import Results, read_results
