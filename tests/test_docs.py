@@ -131,7 +131,8 @@ def test_the_examples_of_the_method_contract_run(
     entry: str,
     settings: str | None,
 ) -> None:
-    from hwp_bench.evaluation.evaluate import EvaluationSettings, evaluate
+    from hwp_bench.evaluation.capture_evaluation import EvaluationSettings
+    from hwp_bench.evaluation.evaluate import evaluate
 
     page = (ROOT / "docs" / "methods.md").read_text()
     manifest = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)[0]
