@@ -51,7 +51,7 @@ def drawn(path: Path, view: SideView) -> Iterator[Any]:
     # Without a display VTK warns that it has none before it draws off screen.
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
     try:
-        plotter = pyvista.Plotter(off_screen=True, window_size=[EDGE, EDGE])
+        plotter: Any = pyvista.Plotter(off_screen=True, window_size=[EDGE, EDGE])
         plotter.set_background("white")
         try:
             yield plotter
