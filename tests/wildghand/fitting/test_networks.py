@@ -19,7 +19,8 @@ from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.capture import Capture
 from hwp_bench.cli.main import main as hwp_bench
 from hwp_bench.commitments.publication import open_captures
-from hwp_bench.evaluation.evaluate import EvaluationSettings, make_plan, with_setting_files
+from hwp_bench.evaluation.capture_evaluation import EvaluationSettings
+from hwp_bench.evaluation.evaluate import make_plan, with_setting_files
 from hwp_bench.methods import find_method, read_manifest
 from hwp_bench.methods.contract import RunSettings, TrainingCapture
 from wildghand.avatar.files import load_avatar
