@@ -168,35 +168,19 @@ def share_camera(hands: Sequence[FittedClip], *, steps: int) -> None:
         descend(hand.model, hand.landmarks, steps, rate=_REFINING, hold=("log_focal",))
 
 
-def fit_outline(
+def refine(
     fitted: FittedClip, *residuals: OutlineResidual | SurfaceResidual, tick: Tick = _no_tick
 ) -> None:
-    """Refine a fit, in place, so that the mesh's outline meets the masks' outline.
+    """Refine a fit, in place, by residuals that are matched to the images in each round.
 
-    With a texture, what lies inside the outline meets the mean of all frames, too.
+    With an outline, the mesh's outline meets the masks'; with a texture, what lies inside meets the
+    mean of all frames. With whole pictures the lit hand, as it is drawn, meets the frames, and its
+    shape, size and distance stay.
     """
-    rounds, steps = fitted.settings.contour_rounds, fitted.settings.contour_steps
-    _refine(fitted, residuals, rounds, steps, _HELD_BY_LANDMARKS, tick)
-
-
-def fit_picture(fitted: FittedClip, picture: PictureResidual, tick: Tick = _no_tick) -> None:
-    """Refine the poses of a fit, in place, so that the lit hand, as it is drawn, meets the frames.
-
-    Shape, size and distance of the hand stay.
-    """
-    rounds = fitted.settings.picture_rounds
-    _refine(fitted, [picture], rounds, PICTURE_STEPS, _HELD_BY_OUTLINE, tick)
-
-
-def _refine(
-    fitted: FittedClip,
-    residuals: Sequence[OutlineResidual | SurfaceResidual],
-    rounds: int,
-    steps: int,
-    hold: tuple[str, ...],
-    tick: Tick,
-) -> None:
-    """Refine a fit, in place, by residuals that are matched to the images again in each round."""
+    chosen, steps, hold = fitted.settings, PICTURE_STEPS, _HELD_BY_OUTLINE
+    rounds = chosen.picture_rounds
+    if not any(isinstance(residual, PictureResidual) for residual in residuals):
+        rounds, steps, hold = chosen.contour_rounds, chosen.contour_steps, _HELD_BY_LANDMARKS
 
     def energy(model: ClipModel, posed: PosedClip) -> torch.Tensor:
         value = fitted.landmarks(model, posed)

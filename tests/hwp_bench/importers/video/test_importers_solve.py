@@ -39,7 +39,7 @@ from hwp_bench.importers.video.solve import (
     SideScores,
     SolveSettings,
     fit_landmarks,
-    fit_outline,
+    refine,
     reprojection_error,
     side_scores,
     warn_of_contradiction,
@@ -234,7 +234,7 @@ def test_the_outline_pulls_a_displaced_hand_back() -> None:
         return float(np.abs((pixels - clip.vertex_pixels).mean(axis=(0, 1)))[0])
 
     before = offset()
-    fit_outline(fitted, contour)
+    refine(fitted, contour)
     assert before > 3.5
     assert offset() < before / 2
 
