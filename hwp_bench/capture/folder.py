@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hwp_bench.base.arrays import write_npz
 from hwp_bench.base.errors import (
     BadCapture,
     BadInput,
@@ -53,8 +54,7 @@ from hwp_bench.capture.schema import (
     read_cameras,
     read_hands,
     read_subject_mesh,
-    write_cameras,
-    write_hands,
+    write_numbers,
 )
 from hwp_bench.hands.skeleton import Camera, HandParameters, HandPose, hand_poses
 from hwp_bench.hands.sources import load_template
@@ -443,12 +443,12 @@ class CaptureWriter:
             kind: combine(by_frame[frame] for frame in range(count))
             for kind, by_frame in self._digests.items()
         }
-        write_hands(self._root / HANDS, self._hands)
-        write_cameras(self._root / CAMERAS, self._cameras)
+        write_numbers(self._root, self._hands, self._cameras)
         digests |= numbers_digests(self._hands, self._cameras)
         if self._true_hands is not None:
-            write_hands(self._root / TRUE_HANDS, self._true_hands)
-            digests["true_hands"] = arrays_digest(hand_arrays(self._true_hands))
+            arrays = hand_arrays(self._true_hands)
+            write_npz(self._root / TRUE_HANDS, arrays)
+            digests["true_hands"] = arrays_digest(arrays)
         info = replace(self.info, digests=dict(sorted(digests.items())))
         write_json(self._root / METADATA, info.to_json())
 
