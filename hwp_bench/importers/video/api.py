@@ -54,10 +54,10 @@ from hwp_bench.importers.video.solve import (
     share_camera,
 )
 from hwp_bench.importers.video.source import (
+    FEW_FITTED,
     LOW_OVERLAP,
     VideoImport,
     VideoSource,
-    fit_warnings,
     landmark_doubts,
     read_source,
     refuse_other_units,
@@ -133,9 +133,13 @@ class ImportedClip:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Things to know before the capture is used; empty for a sound clip."""
-        fitted = {side: hand.parameters.valid for side, hand in self.hands.items()}
-        seen = {side: hand.landmarks.detected for side, hand in self.hands.items()}
-        said = [*self.doubts, *fit_warnings(fitted, seen)]
+        said = list(self.doubts)
+        for side, hand in self.hands.items():
+            fitted, seen = int(hand.parameters.valid.sum()), int(hand.landmarks.detected.sum())
+            if fitted < FEW_FITTED * seen:
+                said.append(
+                    f"the {side} hand is fitted in {fitted} of the {seen} frames that show it"
+                )
         if self.overlap < LOW_OVERLAP:
             said.append(
                 f"the overlap of mesh and mask is {self.overlap:.2f}, of a sound clip 0.9 and more"
