@@ -13,25 +13,25 @@ A format is a frozen dataclass; `parse_record` makes one out of a table that a f
     lamp = parse_record(Lamp, table, where="scene.toml", field="lamps[0]", error=BadInput)
 
 Fields are str, int, float, bool, Literal, `list[X]`, `dict[str, X]`, `tuple[...]`, other
-dataclasses, any of these `| None`, or `Any` (whatever `check_json_values` lets through). A bool is
-not an int, an int is a float, NaN and infinity are refused, and so is text with control
-characters. Bounds are `msgspec.Meta` in an `Annotated` type, or the metadata of `number` and
-`choice`. A pattern in a `Meta` needs a `description`, which messages show.
-
-`msgspec` itself does not read them: its messages name neither the key of a table nor the value.
+dataclasses, any of these `| None`, or `Any` (whatever `check_json_values` lets through).
+`msgspec` does the checking, on a strict twin of the dataclass: a bool is not an int, an int is a
+float, NaN and infinity are refused, and so is text with control characters. Bounds are
+`msgspec.Meta` in an `Annotated` type, or the metadata of `number` and `choice`. A pattern in a
+`Meta` needs a `description`, which messages show, and must exclude control characters itself.
 
 A missing field takes its default, so that a format may get additional fields.
 What no type can say belongs in `__post_init__`, which raises `UsageError(problem, field=name)`;
 the reader adds the file and the path.
+
+`msgspec` decides whether a value is good; `explain` finds the place of a fault in a value that it
+refused, because its own messages name neither the key of a table nor the value.
 """
 
 from __future__ import annotations
 
 import collections.abc
-import contextlib
 import dataclasses
 import math
-import operator
 import os
 import re
 import reprlib
@@ -39,11 +39,12 @@ import sys
 import tomllib
 import types
 import typing
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cache, partial
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, cast
+from typing import Annotated, Any, Literal, TypeVar, Union, cast
 
-from msgspec import Meta
+import msgspec
+from msgspec import UNSET, Meta
 
 from hwp_bench.base.errors import (
     ODD_CHARACTERS,
@@ -62,187 +63,204 @@ _SHOWN = 100
 _REPR = reprlib.Repr()
 _REPR.maxstring = _REPR.maxother = _REPR.maxlong = _SHOWN - 20
 _LARGEST = sys.float_info.max
-# Where denormals are flushed, as in our processes, a smaller difference is none.
+# The least float above 0 that is also above it where denormals are flushed, as in our processes.
 _LEAST = sys.float_info.min
-# The bounds of a number, and their words.
-_BOUNDS: dict[str, tuple[Callable[[Any, Any], bool], str]] = {
-    "ge": (operator.ge, "at least"),
-    "gt": (lambda value, bound: value > bound and value >= bound + _LEAST, "above"),
-    "le": (operator.le, "at most"),
-    "lt": (lambda value, bound: value < bound and value <= bound - _LEAST, "below"),
-}
-_RULES = (*_BOUNDS, "min_length", "max_length", "pattern", "description")
-_WORDS = {bool: "true or false", int: "an integer", float: "a finite number", str: "a text"}
-_WORDS |= {list: "a list", tuple: "a list", dict: "a table"}
-_PLAIN = {collections.abc.Sequence: list, collections.abc.Mapping: dict}
-
-
-class _Form(NamedTuple):
-    """A type without `Annotated` and `| None`, its parts, and what its `Meta`s state."""
-
-    kind: Any
-    #: Forms; words of a `Literal`, and `...` in a tuple of any length, stay as they are.
-    parts: tuple[Any, ...]
-    rules: dict[str, Any]
-    optional: bool
-
-
-def _form(hint: Any) -> _Form:
-    rules: dict[str, Any] = {}
-    optional = False
-    while True:
-        origin, parts = typing.get_origin(hint), typing.get_args(hint)
-        if origin is Annotated:
-            hint = parts[0]
-            stated = {name: getattr(meta, name) for meta in parts[1:] for name in _RULES}
-            rules |= {name: rule for name, rule in stated.items() if rule is not None}
-        elif origin in (Union, types.UnionType):
-            hint, *others = (part for part in parts if part is not types.NoneType)
-            optional |= len(others) < len(parts) - 1
-            if others:
-                return _Form(Union, (_form(hint), *map(_form, others)), rules, optional)
-        else:
-            if origin is not Literal:
-                parts = tuple(part if part is ... else _form(part) for part in parts)
-            return _Form(_PLAIN.get(origin, origin) or hint, parts, rules, optional)
-
-
-class _Field(NamedTuple):
-    """A field of a record: its name and type, the range of its numbers, and its default."""
-
-    name: str
-    form: _Form
-    limits: tuple[float, float] | None
-    required: bool
-
-
-@cache
-def _fields(kind: type) -> tuple[_Field, ...]:
-    hints, missing = typing.get_type_hints(kind, include_extras=True), dataclasses.MISSING
-    found = []
-    for item in dataclasses.fields(kind):
-        choices = item.metadata.get("choices")
-        form = _form(Literal[tuple(choices)] if choices else hints[item.name])
-        required = item.default is missing and item.default_factory is missing
-        found.append(_Field(item.name, form, item.metadata.get("range"), required))
-    return tuple(found)
+_PLAIN_TEXT = Meta(pattern=rf"\A[^{ODD_CHARACTERS}]*\Z")
 
 
 @dataclasses.dataclass(frozen=True)
-class _Reader:
-    """One call of `parse_record`: checks a value by its type, and builds what it stands for."""
+class Rules:
+    """How strictly a record is read; see `hwp_bench.base.records.parse_record`."""
 
-    where: str | os.PathLike[str]
-    error: type[HwpError]
-    numbers: tuple[float, float]
+    low: float
+    high: float
     complete: bool
     ignore_unknown: bool
 
-    def refuse(self, problem: str, path: str, remedy: str | None = None) -> HwpError:
-        return self.error(problem, where=self.where, field=shown(path) or None, remedy=remedy)
 
-    def record(self, kind: Any, value: Any, path: str) -> Any:
+@cache
+def strict_twin(kind: type, rules: Rules) -> type[msgspec.Struct]:
+    """The strict `msgspec.Struct` with the fields of a dataclass, which it has as `__record__`."""
+    hints = typing.get_type_hints(kind, include_extras=True)
+    fields: list[Any] = []
+    for item in dataclasses.fields(kind):
+        strict = _strict(hints[item.name], item.metadata, rules)
+        optional = (item.default, item.default_factory) != (dataclasses.MISSING,) * 2
+        if optional and not rules.complete:
+            fields.append((item.name, Union[strict, msgspec.UnsetType], UNSET))  # noqa: UP007
+        else:
+            fields.append((item.name, strict))
+    free = [item.name for item in dataclasses.fields(kind) if _free(hints[item.name])]
+    return msgspec.defstruct(
+        kind.__name__,
+        fields,
+        kw_only=True,
+        forbid_unknown_fields=not rules.ignore_unknown,
+        namespace={"__record__": kind, "__free__": free},
+    )
+
+
+def _free(hint: Any) -> bool:
+    """Whether a type leaves values open, so that `msgspec` does not look at them."""
+    return hint is Any or any(_free(part) for part in typing.get_args(hint))
+
+
+def _strict(hint: Any, metadata: Mapping[str, Any], rules: Rules) -> Any:
+    """The type of a field as `msgspec` is to check it."""
+    metas: tuple[Any, ...] = ()
+    if typing.get_origin(hint) is Annotated:
+        hint, *given = typing.get_args(hint)
+        metas = tuple(given)
+    origin, parts = typing.get_origin(hint), typing.get_args(hint)
+    if "choices" in metadata:
+        strict: Any = Literal[tuple(metadata["choices"])]
+    elif dataclasses.is_dataclass(hint):
+        strict = strict_twin(typing.cast("type", hint), rules)
+    elif hint in (int, float):
+        metas = (_bounds(hint, metas, metadata.get("range", (rules.low, rules.high))),)
+        strict = hint
+    elif hint is str:
+        if not any(isinstance(meta, Meta) and meta.pattern for meta in metas):
+            metas = (*metas, _PLAIN_TEXT)
+        strict = str
+    elif origin in (Union, types.UnionType):
+        strict = Union[tuple(_strict(part, metadata, rules) for part in parts)]  # noqa: UP007
+    elif origin in (list, collections.abc.Sequence):
+        strict = list[_strict(parts[0], {}, rules)]  # type: ignore[misc]
+    elif origin in (dict, collections.abc.Mapping):
+        strict = dict[_strict(parts[0], {}, rules), _strict(parts[1], {}, rules)]  # type: ignore[misc]
+    elif origin is tuple:
+        inner = (part if part is ... else _strict(part, {}, rules) for part in parts)
+        strict = tuple[tuple(inner)]  # type: ignore[misc]
+    else:
+        strict = hint
+    return Annotated[(strict, *metas)] if metas else strict
+
+
+def _bounds(kind: type, metas: tuple[Any, ...], limits: tuple[float, float]) -> Meta:
+    """The bounds of a number: its own, or else the limits; every float is finite."""
+    own = _limits(metas)
+    low, high = (-math.inf, math.inf) if own else limits
+    if kind is float:
+        # The largest float keeps infinity out, and NaN is above no bound.
+        low, high = max(low, -_LARGEST), min(high, _LARGEST)
+        # `msgspec` takes "above 0" for "at least the smallest float". That is a denormal, which is
+        # equal to 0 where they are flushed, so that 0 would pass.
+        if own.get("gt") == 0.0:
+            own = {name: own[name] for name in own if name != "gt"} | {"ge": _LEAST}
+        if own.get("lt") == 0.0:
+            own = {name: own[name] for name in own if name != "lt"} | {"le": -_LEAST}
+    if math.isfinite(low) and not {"ge", "gt"} & own.keys():
+        own["ge"] = kind(low)
+    if math.isfinite(high) and not {"le", "lt"} & own.keys():
+        own["le"] = kind(high)
+    return Meta(**own)
+
+
+def _limits(metas: Iterable[Any]) -> dict[str, Any]:
+    """The bounds and the description that the `Meta`s of a type state."""
+    names = ("ge", "gt", "le", "lt", "min_length", "max_length", "description")
+    found = [(name, getattr(meta, name, None)) for meta in metas for name in names]
+    return {name: value for name, value in found if value is not None}
+
+
+def explain(kind: Any, value: Any, path: str) -> tuple[str, str, str | None]:
+    """Say what is wrong with a value that `msgspec` refuses: problem, path, remedy."""
+    kind, metas = _unwrap(kind)
+    if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
         if not isinstance(value, Mapping):
-            raise self.refuse("must be a table (a JSON object)", path)
+            return "must be a table (a JSON object)", path, None
         if not all(is_unicode(str(name)) for name in value):
-            raise self.refuse("holds a name that is not Unicode", path)
-        fields = _fields(kind)
-        known = [item.name for item in fields]
-        needed = {item.name for item in fields if item.required or self.complete}
-        missing = needed - value.keys()
-        unknown = set() if self.ignore_unknown else set(map(str, value.keys() - set(known)))
+            return "holds a name that is not Unicode", path, None
+        known = {item.name: item for item in msgspec.structs.fields(kind)}
+        forbidden = kind.__struct_config__.forbid_unknown_fields
+        missing = {name for name, item in known.items() if item.required} - value.keys()
+        unknown = {str(name) for name in value.keys() - known.keys()} if forbidden else set()
         for name in sorted(missing | unknown):
             if name in missing:
-                raise self.refuse("is missing", join(path, name))
-            near = nearest(name, known)
-            remedy = f"Did you mean {join(path, near[0])!r}?" if near else ""
-            remedy = remedy or f"Known: {', '.join(known)}."
-            raise self.refuse("is not known", join(path, name[:_SHOWN]), remedy)
-        made = {
-            name: self.value(form, value[name], join(path, name), limits)
-            for name, form, limits, _ in fields
-            if name in value
-        }
+                return "is missing", join(path, name), None
+            return "is not known", join(path, name[:_SHOWN]), _remedy(name, path, kind)
+    for part, item, place in _parts(kind, value, path):
         try:
-            return kind(**made)
-        except HwpError as fault:
-            raise self.refuse(fault.problem, join(path, fault.field or ""), fault.remedy) from fault
-
-    def value(
-        self, form: _Form, value: Any, path: str, limits: tuple[float, float] | None = None
-    ) -> Any:
-        kind, parts, rules, optional = form
-        if value is None and optional:
-            return None
-        made, sound = value, type(value) is kind
-        if kind is float or kind is int:
-            # Every float is finite; the bounds of a number are its own, or else the limits.
-            low, high = (-math.inf, math.inf) if rules else limits or self.numbers
-            sound |= kind is float and type(value) is int
-            sound = sound and low <= value <= high and (kind is int or abs(value) <= _LARGEST)
-            tests = [(_BOUNDS[name][0], bound) for name, bound in rules.items() if name in _BOUNDS]
-            if sound and all(test(value, bound) for test, bound in tests):
-                return kind(value)
-            if not rules:
-                ends = {"ge": low, "le": high}
-                rules = {name: end for name, end in ends.items() if math.isfinite(end)}
-            sound = False
-        elif kind is Any:
-            check_json_values(value, where=self.where, field=path, error=self.error, null=True)
-            return value
-        elif dataclasses.is_dataclass(kind):
-            return self.record(kind, value, path)
-        elif kind is Union:
-            for part in parts:
-                with contextlib.suppress(HwpError):
-                    return self.value(part, value, path, limits)
-        elif kind is Literal:
-            sound = any(value == one and type(value) is type(one) for one in parts)
-        elif kind is str and isinstance(value, str):
-            sound = not has_odd_characters(value)
-            sound &= re.search(rules.get("pattern", ""), value) is not None
-        elif kind is dict and isinstance(value, Mapping):
-            made, sound = {}, True
-            for key, item in value.items():
-                place = join(path, str(key)[:_SHOWN])
-                made[self.value(parts[0], key, place)] = self.value(parts[1], item, place)
-        elif kind in (list, tuple) and isinstance(value, list | tuple):
-            one = kind is list or parts[-1] is ...
-            kinds = [parts[0]] * len(value) if one else parts
-            sound = len(kinds) == len(value)
-            if sound:
-                places = (f"{path}[{i}]" for i in range(len(value)))
-                made = kind(map(self.value, kinds, value, places))
-        if sound and {"min_length", "max_length"} & rules.keys():
-            sound = rules.get("min_length", 0) <= len(made) <= rules.get("max_length", math.inf)
-        if sound:
-            return made
-        if isinstance(value, str) and has_odd_characters(value):
-            raise self.refuse("holds a control character", path)
-        expected = _expected(form._replace(rules=rules))
-        raise self.refuse(f"is {brief(value)}, expected {expected}", path)
+            msgspec.convert(item, part)
+        except (msgspec.ValidationError, UnicodeEncodeError):  # half of a surrogate pair
+            return explain(part, item, place)
+    if isinstance(value, str) and has_odd_characters(value):
+        return "holds a control character", path, None
+    return f"is {brief(value)}, expected {_expected(kind, metas)}", path, None
 
 
-def _expected(form: _Form) -> str:
+def _parts(kind: Any, value: Any, path: str) -> Iterator[tuple[Any, Any, str]]:
+    """The parts of a value, each with its type and path; none where its form is wrong."""
+    origin, types_ = typing.get_origin(kind), typing.get_args(kind)
+    if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
+        for item in msgspec.structs.fields(kind):
+            if item.name in value:
+                yield item.type, value[item.name], join(path, item.name)
+    elif origin is dict and isinstance(value, Mapping):
+        for key, item in value.items():
+            yield types_[0], key, join(path, str(key)[:_SHOWN])
+            yield types_[1], item, join(path, str(key)[:_SHOWN])
+    elif origin is list and isinstance(value, list | tuple):
+        yield from ((types_[0], item, f"{path}[{i}]") for i, item in enumerate(value))
+    elif origin is tuple and isinstance(value, list | tuple):
+        kinds = [types_[0]] * len(value) if types_[-1] is ... else types_
+        if len(kinds) == len(value):
+            places = (f"{path}[{i}]" for i in range(len(value)))
+            yield from zip(kinds, value, places, strict=True)
+
+
+def _unwrap(kind: Any) -> tuple[Any, tuple[Any, ...]]:
+    """Take `Annotated` and `| None` off a type."""
+    metas: tuple[Any, ...] = ()
+    while True:
+        if typing.get_origin(kind) is Annotated:
+            kind, *given = typing.get_args(kind)
+            metas = (*given, *metas)
+        elif typing.get_origin(kind) in (Union, types.UnionType):
+            parts = [p for p in typing.get_args(kind) if p not in (type(None), msgspec.UnsetType)]
+            if len(parts) != 1:
+                return kind, metas
+            kind = parts[0]
+        else:
+            return kind, metas
+
+
+def _expected(kind: Any, metas: tuple[Any, ...]) -> str:
     """Say in words what a value must be."""
-    kind, parts, rules, _ = form
+    rules = _limits(metas)
+    origin, parts = typing.get_origin(kind), typing.get_args(kind)
     if "description" in rules:
-        return str(rules["description"])
-    if kind is Literal:
+        return rules["description"]
+    if origin is Literal:
         return f"one of {', '.join(map(str, parts))}"
-    if kind is Union:
-        return " or ".join(map(_expected, parts))
-    if kind is tuple and parts[-1] is not ...:
+    if origin in (Union, types.UnionType):
+        return " or ".join(
+            _expected(*_unwrap(part)) for part in parts if part is not msgspec.UnsetType
+        )
+    if origin is tuple and parts[-1] is not ...:
         return f"a list of {len(parts)}"
+    words = {bool: "true or false", int: "an integer", float: "a finite number", str: "a text"}
+    words |= {list: "a list", tuple: "a list", dict: "a table", type(None): "null"}
     least, most = rules.get("min_length", 0), rules.get("max_length")
     if least or most is not None:
         size = f"at least {least:,}" if most is None else f"{least:,} to {most:,}"
-        return f"{_WORDS[kind]} of {size} {'characters' if kind is str else 'entries'}"
-    bounds = {name: rules[name] for name in _BOUNDS if name in rules}
-    if bounds.keys() == {"ge", "le"}:
-        return f"{_WORDS[kind]} from {bounds['ge']:g} to {bounds['le']:g}"
-    said = " and ".join(f"{_BOUNDS[name][1]} {bound:g}" for name, bound in bounds.items())
-    return f"{_WORDS[kind]} {said}".strip()
+        return f"{words[origin or kind]} of {size} {'characters' if kind is str else 'entries'}"
+    sides = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
+    # `_bounds` has no words for 0 and for every float.
+    strict = {("ge", _LEAST): ("gt", 0.0), ("le", -_LEAST): ("lt", 0.0)}
+    found = (strict.get(item, item) for item in rules.items() if abs(item[1]) < _LARGEST)
+    limits: dict[str, float] = dict(found)
+    if {"ge", "le"} == limits.keys():
+        return f"{words[kind]} from {limits['ge']:g} to {limits['le']:g}"
+    bounds = " and ".join(f"{sides[name]} {value:g}" for name, value in limits.items())
+    return f"{words.get(origin or kind, 'another value')} {bounds}".strip()
+
+
+def _remedy(name: str, path: str, kind: type[msgspec.Struct]) -> str:
+    known = kind.__struct_fields__
+    close = nearest(name, known)
+    return f"Did you mean {join(path, close[0])!r}?" if close else f"Known: {', '.join(known)}."
 
 
 def brief(value: Any) -> str:
@@ -316,8 +334,37 @@ def parse_record(
     ignore_unknown: bool = False,
 ) -> Record:
     """Make a dataclass out of a table, checking every field by its annotation."""
-    reader = _Reader(where, error, numbers, complete, ignore_unknown)
-    return cast("Record", reader.record(kind, value, field.rstrip(".")))
+    rules = Rules(*numbers, complete, ignore_unknown)
+    twin = strict_twin(cast("type", kind), rules)
+
+    def refuse(problem: str, path: str, remedy: str | None = None) -> HwpError:
+        return error(problem, where=where, field=shown(path) or None, remedy=remedy)
+
+    def build(item: Any, path: str) -> Any:
+        if isinstance(item, dict):
+            return {key: build(part, join(path, key)) for key, part in item.items()}
+        if isinstance(item, list | tuple):
+            return type(item)(build(part, f"{path}[{i}]") for i, part in enumerate(item))
+        if not isinstance(item, msgspec.Struct):
+            return item
+        given = {name: getattr(item, name) for name in item.__struct_fields__}
+        for name in item.__free__:  # type: ignore[attr-defined]
+            if given[name] is not UNSET:
+                place = join(path, name)
+                check_json_values(given[name], where=where, field=place, error=error, null=True)
+        made = {n: build(v, join(path, n)) for n, v in given.items() if v is not UNSET}
+        try:
+            return item.__record__(**made)  # type: ignore[attr-defined]
+        except HwpError as fault:
+            raise refuse(fault.problem, join(path, fault.field or ""), fault.remedy) from fault
+
+    start = field.rstrip(".")
+    try:
+        converted = msgspec.convert(value, twin)
+    # The second: half of a surrogate pair, where `msgspec` looks a text up.
+    except (msgspec.ValidationError, UnicodeEncodeError) as fault:
+        raise refuse(*explain(twin, value, start)) from fault
+    return build(converted, start)
 
 
 def without_schema(
