@@ -10,6 +10,7 @@ import functools
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any, TypeAlias
 
 import torch
@@ -40,10 +41,6 @@ def cases() -> list[Case]:
     return list(_CASES)
 
 
-def _without_context(run: _Run, given: tuple[Any, ...]) -> Callable[[Any], Any]:
-    return lambda context: run(*given)
-
-
 def _case(name: str, must_hold: str, *values: Any) -> Callable[[_Run], _Run]:
     """Decorator: a case, or one for each value, which stands in its words and is its argument."""
 
@@ -51,7 +48,8 @@ def _case(name: str, must_hold: str, *values: Any) -> Callable[[_Run], _Run]:
         for value in values or ((),):
             given = value if isinstance(value, tuple) else (value,)
             words = name.format(*given), must_hold.format(*given)
-            _CASES.append(Case(words[0], "hands", words[1], _without_context(run, given)))
+            call = partial(lambda given, _: run(*given), given)
+            _CASES.append(Case(words[0], "hands", words[1], call))
         return run
 
     return add
