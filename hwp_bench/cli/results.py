@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 _TABLES = (
     *("overall", "rank", "cost", "captures", "perturbations", "details", "micro", "paper"),
-    *("robustness", "severity", "novelty", "outline", "free-view", "bias", "seeds"),
+    *("robustness", "severity", "clean-share", "novelty", "outline", "free-view", "bias", "seeds"),
 )
 _TABLE = """examples:
   hwp-bench table runs/plain-mini
@@ -38,6 +38,7 @@ _TABLE = """examples:
   hwp-bench table runs/* --by overall --format tex > table.tex
   hwp-bench table runs/mine-mini runs/mine-mini-clean runs/plain-mini --by robustness --base plain
   hwp-bench table runs/mine-seed* --by seeds
+  hwp-bench table runs/mine-persistent* runs/plain-persistent* --by clean-share
   hwp-bench table runs/plain-mini runs/mine-mini --by novelty   # where training showed little
   hwp-bench table runs/plain-mini runs/mine-mini --by outline   # what is drawn outside of the hand
   hwp-bench table runs/plain-mini runs/mine-mini --by free-view   # from all around
@@ -63,7 +64,7 @@ def _add_table(parser: argparse.ArgumentParser) -> None:
     )
     add("--published", action="store_true", help=text)
     add("--base", metavar="NAME", help="robustness: method that the gap is counted from")
-    add_capture_folders(parser, "severities, novelty and outlines")
+    add_capture_folders(parser, "severities, clean shares, novelty and outlines")
     forms = ("terminal", "md", "tex", "csv", "json")
     text = "format of the table (default terminal)"
     add("--format", choices=forms, default="terminal", help=text)
