@@ -56,10 +56,6 @@ PIXEL_BUDGET = 30_000_000
 #: Fewer usable frames than this cannot be compared: all are judged clean. Nor do fewer validation
 #: frames raise the tolerance.
 LEAST_FRAMES = 4
-#: Where fewer frames than this share are like those that are known to be clean, frames are compared
-#: with these and no longer with each other: what most frames of the clip have is perturbed. On
-#: every capture of `mini` and `wild-dev`, which have 35 % or more, 0.35 or more are found.
-SCARCE = 0.3
 # Least deviations that count as one: log gain that shading leaves unexplained, change of the log of
 # the residual, loss of texture, change of the log of the border's width, hidden share of the hand.
 # They are what clean frames of simulated captures show, so that a clip without perturbations has
@@ -92,8 +88,8 @@ def classify_frames(
 ) -> FrameAssessment:
     """Compare (R,) frames of ascending numbers and assess them; every pixel has full weight.
 
-    They are compared with each other, or with frames that are known to be clean if these are given.
-    Then few are clean, and weights are relative: the best `CLEAN_SHARE` of the frames counts as
+    They are compared with each other. Where few are clean, frames that are known to be so are given:
+    then they are compared with those, and weights are relative: the best `CLEAN_SHARE` of the frames counts as
     clean ones do elsewhere, so that a clip without a clean frame is learnt from the least
     perturbed ones.
     """
@@ -304,7 +300,7 @@ def _judge(
     if known_clean is not None:
         known = _readable(_draw(known_clean, surfaces))
         found = [measure_frame(model, frame, shown) for frame in known.values()]
-        if clean_share([*measured.values()], found, given.indices[usable], tolerance) < SCARCE:
+        if clean_share([*measured.values()], found, given.indices[usable], tolerance) < CLEAN_SHARE:
             compared = found
         else:
             indices = np.concatenate([given.indices[usable], known_clean.indices[[*known]]])

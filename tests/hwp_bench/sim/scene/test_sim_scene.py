@@ -132,7 +132,7 @@ def test_a_clean_share_that_episodes_cannot_have_is_refused(make_scene: SceneMak
     assert clean_share(always) == pytest.approx(0.0, abs=1e-3)
     with pytest.raises(UsageError, match="leave 0% of the training part unperturbed instead of 3"):
         with_clean_share(always, 0.3)
-    with pytest.raises(UsageError, match="severity from 1.5 on"):
+    with pytest.raises(UsageError, match=r"severity from 1\.5 on"):
         with_clean_share(with_severity(make_scene(), 1), 0.1)
 
 
