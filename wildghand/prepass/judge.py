@@ -88,10 +88,9 @@ def classify_frames(
 ) -> FrameAssessment:
     """Compare (R,) frames of ascending numbers and assess them; every pixel has full weight.
 
-    They are compared with each other. Where few are clean, frames that are known to be so are given:
-    then they are compared with those, and weights are relative: the best `CLEAN_SHARE` of the frames counts as
-    clean ones do elsewhere, so that a clip without a clean frame is learnt from the least
-    perturbed ones.
+    They are compared with each other, unless few are clean: then with frames that are `known` to be
+    so, and weights are relative. The best `CLEAN_SHARE` of the frames counts as clean ones do
+    elsewhere, so that a clip without a clean frame is learnt from the least perturbed ones.
     """
     count = len(indices)
     rows = np.array(sorted(measured))
