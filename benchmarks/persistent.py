@@ -22,8 +22,7 @@ from hwp_bench.api import evaluate
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.tables import to_markdown, write_tables
 from hwp_bench.methods.manifest import find_method, read_manifest
-from hwp_bench.report.clean_share import clean_share_table, draw_clean_share, scores_by_share
-from hwp_bench.report.figures import write_figure
+from hwp_bench.report.clean_share import clean_share_table, write_clean_share
 from hwp_bench.report.sources import find_captures
 from hwp_bench.results import read_all
 from hwp_bench.sim.produce.capture import ensure_suite, suite
@@ -87,9 +86,7 @@ def draw(out: Path, names: Sequence[str]) -> None:
     captures = find_captures(results)
     table = clean_share_table(results, captures, METRIC)
     write_tables(out / "tables", {"clean-share": table})
-    write_figure(
-        out, "clean-share", draw_clean_share(scores_by_share(results, captures, METRIC), METRIC)
-    )
+    write_clean_share(out, results, captures, METRIC)
     print(to_markdown(table))
 
 

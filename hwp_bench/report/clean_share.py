@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,6 +27,7 @@ from hwp_bench.report.figures import (
     new_figure,
     scale_up,
     series_style,
+    write_figure,
 )
 from hwp_bench.report.tables import HEADLINE, labels
 from hwp_bench.results import Results
@@ -41,7 +43,7 @@ _ASIDE = 0.5
 
 @dataclass(frozen=True)
 class ShareScore:
-    """What one method scores at one share of clean training frames."""
+    """The score of one method at one share of clean training frames."""
 
     #: Name of the method, unique in a table.
     label: str
@@ -68,7 +70,7 @@ def clean_share_of(info: CaptureInfo) -> float | None:
     if any(values is None for values in info.perturbations.values()):
         return None
     train = contiguous_split(info.id, info.frame_count).train
-    worst = [max(frame) for frame in zip(*info.perturbations.values(), strict=True)]  # type: ignore[arg-type]
+    worst = [max(frame) for frame in zip(*info.perturbations.values(), strict=True)]
     return round(float(np.mean([not worst[k] for k in train])), 2) if worst else 1.0
 
 
@@ -146,9 +148,18 @@ def clean_share_table(
         (replace(score, group=""), [one.score.value for one in found]),
         (Column("Low", digits, group="95 %"), [one.score.low for one in found]),
         (Column("High", digits, group="95 %"), [one.score.high for one in found]),
-        (Column("Difference", digits, group="Less the first"), [b and b.value for b in behind]),
-        (Column("Low", digits, group="Less the first"), [b and b.low for b in behind]),
-        (Column("High", digits, group="Less the first"), [b and b.high for b in behind]),
+        (
+            Column("Difference", digits, group="Less the first"),
+            [None if b is None else b.value for b in behind],
+        ),
+        (
+            Column("Low", digits, group="Less the first"),
+            [None if b is None else b.low for b in behind],
+        ),
+        (
+            Column("High", digits, group="Less the first"),
+            [None if b is None else b.high for b in behind],
+        ),
         (Column("Captures", 0), [one.score.captures for one in found]),
         (Column("Seeds", 0), [one.seeds for one in found]),
     ]
@@ -163,8 +174,8 @@ def clean_share_table(
 def draw_clean_share(found: Sequence[ShareScore], metric: str) -> Figure:
     """Draw the score of every method over the share of clean frames, with 95 % intervals.
 
-    Intervals of several methods at one share stand beside each other; those that leave the figure
-    are cut there, so that wide intervals of few captures do not press the curves flat.
+    Intervals of several methods at one share stand next to each other. One that leaves the figure
+    is cut there, so that wide intervals of few captures do not press the curves flat.
     """
     from matplotlib.ticker import FixedLocator, FuncFormatter
 
@@ -207,3 +218,14 @@ def draw_clean_share(found: Sequence[ShareScore], metric: str) -> Figure:
             title="Lines: 95 % intervals over captures", title_fontsize=9,
         )  # fmt: skip
     return figure
+
+
+def write_clean_share(
+    folder: Path,
+    results: Sequence[Results],
+    captures: Mapping[str, CaptureInfo],
+    metric: str = HEADLINE[0],
+) -> list[Path]:
+    """Write the figure into a folder, `clean-share.png` and `.svg`; returns both."""
+    figure = draw_clean_share(scores_by_share(results, captures, metric), metric)
+    return write_figure(folder, "clean-share", figure)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from types import MappingProxyType
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -141,7 +141,7 @@ def neutral_assessment(
 ) -> FrameAssessment:
     """Call every usable frame, (R,) bool, clean, because there is too little to compare."""
     zeros, good = np.zeros(len(indices)), usable.astype(np.float64)
-    nothing = {item.name: zeros for item in fields(FrameAssessment)}
+    nothing: dict[str, Any] = {item.name: zeros for item in fields(FrameAssessment)}
     return FrameAssessment(
         **nothing
         | {

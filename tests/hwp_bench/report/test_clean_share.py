@@ -13,8 +13,8 @@ from hwp_bench.report.clean_share import (
     clean_share_table,
     draw_clean_share,
     scores_by_share,
+    write_clean_share,
 )
-from hwp_bench.report.figures import write_figure
 from hwp_bench.results import Results, write_results
 
 
@@ -81,7 +81,7 @@ def test_the_command_prints_it_and_the_figure_has_every_method(study, tmp_path, 
     assert main(["table", *folders, "--by", "clean-share"]) == 2
     assert "render the suite" in capsys.readouterr().err
     figure = draw_clean_share(scores_by_share(results, captures, "psnr"), "psnr")
-    written = write_figure(tmp_path, "clean-share", figure)
+    written = write_clean_share(tmp_path, results, captures)
     assert [path.suffix for path in written] == [".png", ".svg"]
     (axes,) = figure.axes
     curves = [
