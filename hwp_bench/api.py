@@ -17,8 +17,8 @@ from hwp_bench.analysis.compare import Comparison, compare_results
 from hwp_bench.base.console import JobsView, notice
 from hwp_bench.base.errors import UsageError, of_type, place, whole_number
 from hwp_bench.capture import Capture
+from hwp_bench.evaluation.capture_evaluation import EvaluationSettings
 from hwp_bench.evaluation.evaluate import (
-    EvaluationSettings,
     check_call,
     check_results_place,
     check_suite,

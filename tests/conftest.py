@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 # isort: off
-from worker_threads import WORKER  # first: it says how many threads NumPy and torch use
+from worker_threads import (
+    WORKER,
+    WORKER_NUMBER,
+)  # first: it says how many threads NumPy and torch use
 
 # isort: on
 from collections.abc import Callable
@@ -43,18 +46,23 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session")
 def machine_code(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """Everything is compiled that tests need, by the first of the workers that asks for it."""
-    from own_cache import compile_all
+    """Everything is compiled that tests need, each part by the first worker that asks for it.
+
+    Every second worker begins with the last part, so that two share the work.
+    """
+    from own_cache import COMPILED
 
     from hwp_bench.base.folders import exclusive
 
     # All workers' temporary folders lie in one.
     shared = tmp_path_factory.getbasetemp().parent if WORKER else tmp_path_factory.getbasetemp()
-    done = shared / "compiled"
-    with exclusive(done, wait=True):
-        if not done.exists():
-            compile_all()
-            done.touch()
+    parts = list(COMPILED)
+    for part in parts[::-1] if WORKER_NUMBER % 2 else parts:
+        done = shared / f"compiled-{part}"
+        with exclusive(done, wait=True):
+            if not done.exists():
+                COMPILED[part]()
+                done.touch()
 
 
 @pytest.fixture

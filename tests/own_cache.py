@@ -4,23 +4,30 @@ from __future__ import annotations
 
 import contextlib
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 from hwp_bench.base.files import cache_root
 from hwp_bench.base.kernels import code_folder
 
 
-def compile_all() -> None:
-    """Compile what fits, drawing and rendering need, and paint the skin of `capture0`'s subject.
-
-    Processes of the suite would each do it otherwise, at the same time.
-    """
-    from hwp_bench.sim.render.frame import render_frame
-    from hwp_bench.sim.scene_files import load_scene
+def compile_fits() -> None:
+    """Compile what fits and drawing need."""
     from wildghand.fitting.method import ready_fit
 
     ready_fit("cpu")
+
+
+def compile_renders() -> None:
+    """Compile what rendering needs, and paint the skin of `capture0`'s subject."""
+    from hwp_bench.sim.render.frame import render_frame
+    from hwp_bench.sim.scene_files import load_scene
+
     render_frame(load_scene("capture0"), 0, 10, 32)
+
+
+#: What processes of the suite would otherwise each compile, at the same time.
+COMPILED: dict[str, Callable[[], None]] = {"fits": compile_fits, "renders": compile_renders}
 
 
 def make_own_cache(folder: Path, *, skins: bool = False) -> Path:

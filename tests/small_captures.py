@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import functools
+import json
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
+from hwp_bench.base.files import sha256_json
 from hwp_bench.capture import Cameras, Capture, HandModelId, identify_hand_model
 from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.results import CaptureResult, CurvePoint, FrameResult, MethodId, Results
@@ -52,6 +55,20 @@ def hand_picture(frame: int, size: int, seed: int = 0) -> tuple[np.ndarray, np.n
     skin = np.stack([texture, texture * 0.8, texture * 0.7], axis=2)
     picture = np.where(inside[:, :, None], skin, background).astype(np.uint8)
     return picture, (inside * 255).astype(np.uint8)
+
+
+def split_file(path: Path, capture: str, train: list[int], frames: int) -> str:
+    """Write a split of one capture that trains on few frames; returns its path."""
+    content = {
+        "capture": capture,
+        "frame_count": frames,
+        "train": train,
+        "validation": [frames - 3, frames - 2],
+        "test": [frames - 2, frames],
+    }
+    split = {**content, "digest": sha256_json(content)}
+    path.write_text(json.dumps({"schema": "hwp-splits/1", "splits": [split]}))
+    return str(path)
 
 
 def results_example(name: str = "plain", psnr: float = 20.0, digest: str = "d") -> Results:

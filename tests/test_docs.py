@@ -92,7 +92,7 @@ def test_files_and_modules_exist(page: Path) -> None:
     words = re.findall(r"`([\w./-]+)`", page.read_text(encoding="utf-8"))
     for word in words:
         if word.split("/")[0] in TOPS and "/" in word:
-            # A room may be a module; pages about tests name them from `tests/`.
+            # A package may be a module; pages about tests name them from `tests/`.
             places = (ROOT / word, ROOT / f"{word}.py", ROOT / "tests" / word)
             assert any(place.exists() for place in places), word
         elif word.split(".")[0] in (*TOPS, "plain_fit") and not word.endswith((".json", ".md")):
@@ -131,7 +131,8 @@ def test_the_examples_of_the_method_contract_run(
     entry: str,
     settings: str | None,
 ) -> None:
-    from hwp_bench.evaluation.evaluate import EvaluationSettings, evaluate
+    from hwp_bench.evaluation.capture_evaluation import EvaluationSettings
+    from hwp_bench.evaluation.evaluate import evaluate
 
     page = (ROOT / "docs" / "methods.md").read_text()
     manifest = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)[0]

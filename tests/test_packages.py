@@ -85,16 +85,6 @@ def test_packages_import_only_what_lies_below(package: str) -> None:
     assert wrong == []
 
 
-def test_the_benchmark_never_imports_the_methods() -> None:
-    wrong = [
-        f"{name} imports {target}"
-        for name, targets in every_import().items()
-        for target in targets
-        if name.startswith("hwp_bench") and target.startswith("wildghand")
-    ]
-    assert wrong == []
-
-
 def test_the_rasterizer_imports_nothing_of_the_method() -> None:
     allowed = ("wildghand.splat", "hwp_bench.base", "hwp_bench.stability")
     wrong = [

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 from small_captures import CaptureMaker
 
-from hwp_bench.evaluation.evaluate import EvaluationSettings, evaluate
+from hwp_bench.evaluation.capture_evaluation import EvaluationSettings
+from hwp_bench.evaluation.evaluate import evaluate
 from hwp_bench.run.sandbox.confinement import Confinement
 
 TESTS = Path(__file__).parent

@@ -12,9 +12,14 @@ TINY: dict[str, Any] = {
     "network.plane_resolution": 12,
     "device": "cpu",
 }
-#: The same with nothing that looks at the frames before the first step: no verdict on them, and the
-#: hand model as it is.
-UNJUDGED: dict[str, Any] = {**TINY, "prepass.enabled": False, "subject.enabled": False}
+#: The same with nothing that looks at the frames before the first step: no verdict on them, no
+#: shadows, and the hand model as it is.
+UNJUDGED: dict[str, Any] = {
+    **TINY,
+    "prepass.enabled": False,
+    "subject.enabled": False,
+    "shadows.enabled": False,
+}
 #: The network alone.
 BARE: dict[str, Any] = {**TINY, "mode": "bare"}
 #: A network that learns what a small clip shows.

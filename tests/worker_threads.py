@@ -15,6 +15,8 @@ import hwp_bench  # noqa: F401
 
 #: Whether this process is a worker.
 WORKER = "PYTEST_XDIST_WORKER" in os.environ
+#: Which one, from 0: the variable is gw0, gw1, ...
+WORKER_NUMBER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
 if WORKER:
     if "numpy" in sys.modules:
         raise RuntimeError("NumPy was loaded before tests/worker_threads.py could tell it how")

@@ -13,6 +13,8 @@ from hwp_bench.results import CaptureResult
 
 #: Checkpoints earlier than this are taken to be at this moment, s: log time needs one above 0.
 EARLIEST = 1e-3
+#: Fewest captures that have an interval: Student's t of two is 12.7, which says nothing.
+LEAST_CAPTURES = 3
 #: Moments at which curves are read for the front.
 MOMENTS = 400
 
@@ -94,7 +96,7 @@ class MeanCurve:
     seconds: np.ndarray
     #: (T,) mean score over captures, each a mean over seeds.
     scores: np.ndarray
-    #: (T,) lower end of the interval over captures; None with one capture.
+    #: (T,) lower end of the interval over captures; None with fewer than `LEAST_CAPTURES`.
     low: np.ndarray | None
     #: (T,) upper end.
     high: np.ndarray | None
@@ -130,7 +132,7 @@ def mean_curve(label: str, curves: Mapping[str, Sequence[Curve]]) -> MeanCurve |
     moments = moments[(moments >= start) & (moments <= stop)]
     rows = np.stack([np.mean([c.at(moments) for c in fits], axis=0) for fits in curves.values()])
     mean = rows.mean(axis=0)
-    if len(rows) < 2:
+    if len(rows) < LEAST_CAPTURES:
         return MeanCurve(label, moments, mean, None, None)
     from scipy.stats import t
 

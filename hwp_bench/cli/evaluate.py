@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from hwp_bench.commitments import SealedPart
     from hwp_bench.evaluation.ablate.runs import AblationRuns
     from hwp_bench.evaluation.budget.budget import BudgetRuns
-    from hwp_bench.evaluation.evaluate import EvaluationSettings, OnCapture
+    from hwp_bench.evaluation.capture_evaluation import EvaluationSettings
+    from hwp_bench.evaluation.evaluate import OnCapture
     from hwp_bench.methods.manifest import MethodManifest
     from hwp_bench.results import Results
 
@@ -113,8 +114,10 @@ def _evaluate(args: argparse.Namespace) -> int:
     elif results.drawn:
         novel = free_view_tables([results])
         tables = {**all_tables([results]), **novel}
-        for name in ("overall", "captures", *novel):
-            print_table(tables[name])
+        for name in ("overall", "perturbations", "captures", *novel):
+            # Captures of a person's own may have no perturbation to speak of.
+            if len(tables[name].columns) > 1:
+                print_table(tables[name])
     return _report_outcome(out, results)
 
 
@@ -197,7 +200,7 @@ def _notice_failures(folder: Path, results: Results, head: str = "") -> int:
 
 def _evaluation_settings(args: argparse.Namespace) -> EvaluationSettings:
     """Return the settings that `_add_evaluation` and `--seed` gave."""
-    from hwp_bench.evaluation.evaluate import EvaluationSettings
+    from hwp_bench.evaluation.capture_evaluation import EvaluationSettings
     from hwp_bench.methods.contract import Budget, RunSettings
     from hwp_bench.run.sandbox.confinement import Confinement
 
@@ -226,6 +229,7 @@ _ABLATE = """examples:
   hwp-bench ablate --no-dpd --no-pao --no-heads          # each out of the full method, all out
   hwp-bench ablate --binary-mask                         # a binary mask in place of PAO's weights
   hwp-bench ablate --only dpd pao heads                  # 2 x 2 x 2
+  hwp-bench ablate --base paper                          # the paper's Table 6: no addition of ours
   hwp-bench ablate my_method --without loss --budget 60  # what a third party's method declares
   hwp-bench ablate --suite full --engine ray://10.0.0.1:6379 --job-gpus 1
 
@@ -235,6 +239,7 @@ Which variants are run:
   --only A B ...  the named components, crossed: 2^k
   other flags     the full method; each of the named components out of it (alternatives: put in);
                   and, of two components or more, all of them out
+The first row is the barest; a line says which components it keeps. --base NAME takes these out too.
 
 Started again with the same arguments, it takes finished jobs as they are; results of other settings
 are refused, or replaced at the end with --overwrite. Exit status 1: the method failed on a capture
@@ -258,9 +263,11 @@ def _add_ablate(parser: argparse.ArgumentParser) -> None:
     text = "throw a switch of the method's method.toml; may be given again"
     add("--without", dest="thrown", action="append", metavar="SWITCH", help=text)
     add("--only", **SEVERAL, metavar="COMPONENT", help="cross these components")
+    text = "start from this simpler form that method.toml declares: wildghand has paper, released"
+    add("--base", metavar="NAME", help=text)
     _add_evaluation(parser)
     add("--seeds", type=int, default=3, help="number of seeds (default 3)")
-    add("-o", "--out", help="folder (default runs/ablation-METHOD-SUITE)")
+    add("-o", "--out", help="folder (default runs/ablation-METHOD-SUITE[-BASE])")
     add_json(parser, "print the record, ablation.json")
 
 
@@ -275,8 +282,9 @@ def _ablate(args: argparse.Namespace) -> int:
     # A wrong method, setting or switch must be reported before a suite is rendered for it.
     manifest = read_manifest(find_method(args.method))
     check_settings(manifest, settings.run.settings, "--set")
-    design = make_design(manifest, args.thrown or [], args.only)
-    out = Path(args.out or f"runs/ablation-{manifest.name}-{settings.suite}")
+    design = make_design(manifest, args.thrown or [], args.only, args.base)
+    based = f"-{args.base}" if args.base else ""
+    out = Path(args.out or f"runs/ablation-{manifest.name}-{settings.suite}{based}")
     seeds = range(args.seeds)
     with _running(args, manifest, settings, out) as (captures, jobs, options):
         names = ", ".join(variant.name for variant in design.variants)
@@ -289,6 +297,7 @@ def _ablate(args: argparse.Namespace) -> int:
 def _report_ablate(ablation: AblationRuns, out: Path, *, as_json: bool) -> int:
     from hwp_bench.analysis.pairing import common_metrics
     from hwp_bench.evaluation.ablate.effects import (
+        PRINTED,
         ablation_record,
         ablation_tables,
         cost_effects,
@@ -309,7 +318,7 @@ def _report_ablate(ablation: AblationRuns, out: Path, *, as_json: bool) -> int:
     if as_json:
         print_json(record)
     elif any(result.drawn for result in ablation.results):
-        for name in ("ablation", "effects", "component_cost", "seconds"):
+        for name in PRINTED:
             if name in tables:
                 print_table(tables[name])
     _draw_ablate(ablation, out)
@@ -435,13 +444,8 @@ def _add_demo(parser: argparse.ArgumentParser) -> None:
 def _demo(args: argparse.Namespace) -> int:
     from hwp_bench.capture import open_capture
     from hwp_bench.evaluation.artifacts import write_side_by_side
-    from hwp_bench.evaluation.evaluate import (
-        EvaluationSettings,
-        check_call,
-        check_results_place,
-        check_suite,
-        evaluate,
-    )
+    from hwp_bench.evaluation.capture_evaluation import EvaluationSettings
+    from hwp_bench.evaluation.evaluate import check_call, check_results_place, check_suite, evaluate
     from hwp_bench.methods import find_method, read_manifest
     from hwp_bench.report.sources import ResultsSource
     from hwp_bench.report.tables import all_tables

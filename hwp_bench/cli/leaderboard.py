@@ -167,7 +167,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _add(args: argparse.Namespace, folder: Path) -> int:
-    from hwp_bench.leaderboard.soundness import check_source
+    from hwp_bench.leaderboard.rules import check_source
     from hwp_bench.leaderboard.submit import add_entry
     from hwp_bench.results import read_results, results_among
 
@@ -179,7 +179,7 @@ def _add(args: argparse.Namespace, folder: Path) -> int:
 
 
 def _submit(args: argparse.Namespace, folder: Path) -> int:
-    from hwp_bench.leaderboard.soundness import check_source, sound_entries
+    from hwp_bench.leaderboard.rules import check_source, sound_entries
     from hwp_bench.leaderboard.submit import TEXT, submit
     from hwp_bench.report.sources import read_sources, source_folders
     from hwp_bench.results import results_among
@@ -229,13 +229,14 @@ def _check_line(option: str, text: str) -> None:
 def _check(args: argparse.Namespace, folder: Path) -> int:
     from hwp_bench.leaderboard.entries import read_entries
     from hwp_bench.leaderboard.rules import (
+        check_bound,
         check_complete,
+        check_dates,
         check_entries,
         check_names,
         check_unchanged,
         read_names,
     )
-    from hwp_bench.leaderboard.soundness import check_bound, check_dates
 
     _refuse_none(folder)
     entries = check_entries(read_entries(folder))
@@ -267,8 +268,8 @@ def _show(args: argparse.Namespace, folder: Path) -> int:
 
 
 def _confirm(args: argparse.Namespace, folder: Path) -> int:
-    from hwp_bench.leaderboard.entries import refuse_installed, write_check
-    from hwp_bench.leaderboard.soundness import readable_entries
+    from hwp_bench.leaderboard.entries import read_entries, refuse_installed, write_check
+    from hwp_bench.leaderboard.rules import left_out
     from hwp_bench.leaderboard.submit import confirm, entry_of
     from hwp_bench.results import read_results, result_files
 
@@ -276,7 +277,7 @@ def _confirm(args: argparse.Namespace, folder: Path) -> int:
     refuse_installed(folder)
     _refuse_none(folder)
     (file,) = result_files(args.results)
-    entries = readable_entries(folder)
+    entries = read_entries(folder, left_out)
     # Before a suite is rendered for it.
     entry = entry_of(entries, read_results(file), args.entry)
     if not 0 <= args.tolerance <= 100:
@@ -302,12 +303,11 @@ def _confirm(args: argparse.Namespace, folder: Path) -> int:
 
 
 def _register(args: argparse.Namespace, folder: Path) -> int:
-    from hwp_bench.leaderboard.entries import refuse_installed
-    from hwp_bench.leaderboard.rules import NAME, register
-    from hwp_bench.leaderboard.soundness import readable_entries
+    from hwp_bench.leaderboard.entries import read_entries, refuse_installed
+    from hwp_bench.leaderboard.rules import NAME, left_out, register
 
     refuse_installed(folder)
-    entries = {entry.name: entry for entry in readable_entries(folder)}
+    entries = {entry.name: entry for entry in read_entries(folder, left_out)}
     for name in args.names:
         if name not in entries:
             raise UsageError("is not an entry", where=folder, field=name)
@@ -342,7 +342,7 @@ def _refuse_none(folder: Path) -> None:
 
 def _sound_entries(folder: Path) -> list[Entry]:
     """Read the sound entries of a folder; one without any is refused, as its board is empty."""
-    from hwp_bench.leaderboard.soundness import sound_entries
+    from hwp_bench.leaderboard.rules import sound_entries
 
     _refuse_none(folder)
     entries = sound_entries(folder)

@@ -54,18 +54,30 @@ _FACTS = (
 
 
 @dataclass(frozen=True)
+class EvaluationSettings:
+    """How a method is evaluated."""
+
+    #: Name of the suite, for the record and as the name of the preset that fits it.
+    suite: str = "captures"
+    #: Preset of the method; None takes the one named like the suite, else `default`.
+    preset: str | None = None
+    #: Single settings that override the preset, seed, budget and training frames.
+    run: RunSettings = field(default_factory=RunSettings)
+    #: Seconds after which a method is killed on one capture.
+    time_limit: float = DEFAULT_TIME_LIMIT
+    #: How its process is confined, and its memory limit.
+    confinement: Confinement = field(default_factory=Confinement)
+
+
+@dataclass(frozen=True)
 class CaptureEvaluation:
     """One method on one capture."""
 
     manifest: MethodManifest
     capture: Capture
     split: Split
-    #: Settings, seed, budget and training frames.
-    run: RunSettings
-    #: Seconds after which the method is killed.
-    time_limit: float = DEFAULT_TIME_LIMIT
-    #: How the method's process is confined; it decides no score.
-    confinement: Confinement = field(default_factory=Confinement)
+    #: How it is evaluated, with all settings of the method.
+    settings: EvaluationSettings
     #: LPIPS by backbone, where the weights are there.
     networks: Mapping[str, Network] = field(default_factory=dict)
     #: Digests of the method's files when the evaluation was planned; None takes them as they are.
@@ -74,22 +86,22 @@ class CaptureEvaluation:
     @property
     def exposed(self) -> str | None:
         """Digest (hex) of the files that the method is shown next to its request, if any."""
-        exposed = self.confinement.exposed
+        exposed = self.settings.confinement.exposed
         return exposed_digest(exposed) if exposed else None
 
     @property
     def key(self) -> str:
         """Digest (hex) of everything that decides the scores."""
-        planned, clip = self.method_files, self.capture.free_view
+        planned, clip, run = self.method_files, self.capture.free_view, self.settings.run
         method = self.manifest.digest if planned is None else digest_of(planned)
         return _key(
             method=(self.manifest.name, method),
             capture=self.capture.digest,
             split=self.split.digest,
-            settings=dict(self.run.settings),
-            seed=self.run.seed,
-            budget=asdict(self.run.budget),
-            frames=self.run.frames,
+            settings=dict(run.settings),
+            seed=run.seed,
+            budget=asdict(run.budget),
+            frames=run.frames,
             protocols=[protocol.as_dict() for protocol in PROTOCOLS],
             networks=sorted(self.networks),
             exposed=self.exposed,
@@ -98,8 +110,9 @@ class CaptureEvaluation:
 
     def hiding(self, folder: Path) -> CaptureEvaluation:
         """Return the same where the method does not see a results folder, with its test frames."""
-        hidden = (*self.confinement.hidden, folder.absolute())
-        return replace(self, confinement=replace(self.confinement, hidden=hidden))
+        confinement = self.settings.confinement
+        confinement = replace(confinement, hidden=(*confinement.hidden, folder.absolute()))
+        return replace(self, settings=replace(self.settings, confinement=confinement))
 
     def job(self, folder: Path, text: str, needs: Needs) -> Job:
         """Return it as a job of an engine, which shows the text; its result goes to the folder.
@@ -111,7 +124,7 @@ class CaptureEvaluation:
         inputs = {"capture": Folder(self.capture.root, (EXTRA,))}
         if shipped is None:
             inputs["method"] = Folder(root)
-        same = {name: getattr(self, name) for name in ("split", "run", "time_limit", "confinement")}
+        same = (self.split, self.settings)
         return Job(
             text=text,
             here=partial(evaluate_capture, self, folder),
@@ -192,17 +205,20 @@ def _run(
     evaluation: CaptureEvaluation, output: Path, on_progress: OnProgress
 ) -> tuple[RunRecord | None, str | None]:
     """Run the method on a copy of what it may see; returns the record, or why it failed."""
+    settings = evaluation.settings
     with scratch_folder("hwp-request-") as temporary:
         request = temporary / "request"
         try:
             if evaluation.manifest.kind != "predictions":
-                write_request(request, evaluation.capture, evaluation.split, evaluation.run)
+                write_request(
+                    request, evaluation.capture, evaluation.split, evaluation.settings.run
+                )
             record = run_method(
                 evaluation.manifest,
                 evaluation.capture.info.id,
                 request,
                 output,
-                time_limit=evaluation.time_limit,
+                time_limit=settings.time_limit,
                 confinement=_confinement(evaluation, output),
                 on_progress=on_progress,
             )
@@ -219,7 +235,7 @@ def _run(
 
 def _confinement(evaluation: CaptureEvaluation, output: Path) -> Confinement:
     """Hide what holds test frames: the capture, and results next to the run."""
-    asked = evaluation.confinement
+    asked = evaluation.settings.confinement
     hands = hand_model_files(evaluation.capture.info.hand_model.source)
     hidden = (*asked.hidden, evaluation.capture.root, output.parent.parent)
     return replace(asked, exposed=(*asked.exposed, *hands), hidden=hidden)
@@ -285,7 +301,7 @@ def _refuse_edited(evaluation: CaptureEvaluation) -> None:
 
 def _refuse_changed(evaluation: CaptureEvaluation) -> None:
     """Refuse a capture, or a clip in it, whose content is not that of the digests."""
-    clean = evaluation.run.frames != FRAME_CHOICES[0]
+    clean = evaluation.settings.run.frames != FRAME_CHOICES[0]
     for capture in (evaluation.capture, evaluation.capture.free_view):
         if capture is None:
             continue
@@ -311,7 +327,7 @@ def stored_result(evaluation: CaptureEvaluation, folder: Path) -> CaptureResult 
         result = read_result(folder)
     except HwpError:
         return None
-    if evaluation.confinement.mode == "required" and result.isolation != ISOLATED:
+    if evaluation.settings.confinement.mode == "required" and result.isolation != ISOLATED:
         return None
     return result if result.key == evaluation.key and result.failure is None else None
 
@@ -363,7 +379,7 @@ def key_of(results: Results, capture: CaptureResult, clip: str | None) -> str:
 
 
 def evaluate_elsewhere(
-    same: Mapping[str, Any],
+    same: tuple[Split, EvaluationSettings],
     networks: Sequence[str],
     shipped: str | None,
     key: str,
@@ -383,9 +399,9 @@ def evaluate_elsewhere(
     evaluation = CaptureEvaluation(
         manifest,
         open_capture(inputs["capture"]),
+        *same,
         networks={name: known[name] for name in networks},
         method_files=method_files(manifest.root),
-        **same,
     )
     if evaluation.key != key:
         raise HwpError(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TypedDict, Unpack
 
@@ -21,7 +21,7 @@ from hwp_bench.base.records import check_json_values, merged, parse_record
 from hwp_bench.capture import Capture
 from hwp_bench.capture.splits import Split, split_for
 from hwp_bench.commitments.publication import open_captures
-from hwp_bench.evaluation.capture_evaluation import CaptureEvaluation
+from hwp_bench.evaluation.capture_evaluation import CaptureEvaluation, EvaluationSettings
 from hwp_bench.evaluation.results_folder import (
     RESULTS,
     announce_kept,
@@ -30,7 +30,7 @@ from hwp_bench.evaluation.results_folder import (
     refuse_other,
 )
 from hwp_bench.methods.contents import digest_of, method_files, refuse_links_out
-from hwp_bench.methods.contract import FRAME_CHOICES, RunSettings
+from hwp_bench.methods.contract import FRAME_CHOICES
 from hwp_bench.methods.manifest import (
     DEFAULT_PRESET,
     MethodManifest,
@@ -45,8 +45,7 @@ from hwp_bench.metrics.score import Network
 from hwp_bench.results import CaptureResult, MethodId, Results, write_results
 from hwp_bench.results.schema import environment
 from hwp_bench.run.engine import Engine, LocalEngine, Needs
-from hwp_bench.run.runner import DEFAULT_TIME_LIMIT, rehearse_method
-from hwp_bench.run.sandbox.confinement import Confinement
+from hwp_bench.run.runner import rehearse_method
 from hwp_bench.sim.produce.capture import SuiteItem, is_rendered, suite
 
 #: Most seconds that a method may take to be made before the first capture.
@@ -54,22 +53,6 @@ REHEARSAL_SECONDS = 600.0
 #: Called when a capture's work begins, with (index, count, capture id); returns a function that is
 #: then called with (done, total) steps.
 OnCapture = Callable[[int, int, str], Callable[[int, int], None] | None]
-
-
-@dataclass(frozen=True)
-class EvaluationSettings:
-    """How a method is evaluated."""
-
-    #: Name of the suite, for the record and as the name of the preset that fits it.
-    suite: str = "captures"
-    #: Preset of the method; None takes the one named like the suite, else `default`.
-    preset: str | None = None
-    #: Single settings that override the preset, seed, budget and training frames.
-    run: RunSettings = field(default_factory=RunSettings)
-    #: Seconds after which a method is killed on one capture.
-    time_limit: float = DEFAULT_TIME_LIMIT
-    #: How its process is confined, and its memory limit.
-    confinement: Confinement = field(default_factory=Confinement)
 
 
 class How(TypedDict, total=False):
@@ -260,16 +243,7 @@ def make_plan(
     files = method_files(manifest.root)
     networks = load_available() if networks is None else networks
     evaluations = tuple(
-        CaptureEvaluation(
-            manifest,
-            capture,
-            split,
-            settings.run,
-            settings.time_limit,
-            settings.confinement,
-            networks,
-            files,
-        )
+        CaptureEvaluation(manifest, capture, split, settings, networks, files)
         for capture, split in captures
     )
     started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 from msgspec import Meta
 
@@ -41,6 +41,7 @@ BADGES = {
 #: What a link of a submission can lead to.
 LINKS = ("code", "paper", "predictions", "avatars")
 
+T = TypeVar("T")
 #: A moment, ISO 8601 in UTC.
 Moment = Annotated[
     str,
@@ -311,17 +312,16 @@ def refuse_installed(folder: Path) -> None:
         )
 
 
-def read_entries(folder: Path) -> list[Entry]:
-    """Read every entry of a folder with its checks, by name."""
-    checks = []
-    for check, fault in read_checks(folder):
-        if fault is not None:
-            raise fault
-        if check is not None:
-            checks.append(check)
-    entries = [read_entry(file, checks) for file in entry_files(folder)]
+def read_entries(folder: Path, on_fault: Callable[[HwpError], None] | None = None) -> list[Entry]:
+    """Read every entry of a folder with its checks, by name.
+
+    A damaged file, and a check of an entry or content that is not there, is refused. With
+    `on_fault` they are left out, and it is called with what is wrong with a file.
+    """
+    checks = _read_all(sorted((folder / CHECKS).glob("*.json")), _read_check, on_fault)
+    entries = _read_all(entry_files(folder), lambda file: read_entry(file, checks), on_fault)
     known = {(entry.name, entry.digest) for entry in entries}
-    for check in checks:
+    for check in checks if on_fault is None else ():
         if (check.entry, check.entry_digest) not in known:
             raise BadResult(
                 f"is of {check.entry} with digest {check.entry_digest[:8]}, which is not there",
@@ -331,18 +331,23 @@ def read_entries(folder: Path) -> list[Entry]:
     return entries
 
 
+def _read_all(
+    files: Iterable[Path], read: Callable[[Path], T], on_fault: Callable[[HwpError], None] | None
+) -> list[T]:
+    found = []
+    for file in files:
+        try:
+            found.append(read(file))
+        except HwpError as error:
+            if on_fault is None:
+                raise
+            on_fault(error)
+    return found
+
+
 def entry_files(folder: Path) -> list[Path]:
     """Return the files of the entries of a folder, by name; none where there is no folder."""
     return sorted(folder.glob("*.json")) if folder.is_dir() else []
-
-
-def read_checks(folder: Path) -> Iterator[tuple[Check | None, HwpError | None]]:
-    """Read every check below a folder of entries, by name: the check, or why it cannot be read."""
-    for file in sorted((folder / CHECKS).glob("*.json")):
-        try:
-            yield _read_check(file), None
-        except HwpError as error:
-            yield None, error
 
 
 def read_entry(file: Path, checks: Sequence[Check]) -> Entry:

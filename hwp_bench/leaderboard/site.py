@@ -31,7 +31,7 @@ from hwp_bench.leaderboard.rules import HEADLINE, SUITES, check_entries, source_
 from hwp_bench.methods.manifest import shipped_methods
 from hwp_bench.metrics import HWP_V1
 from hwp_bench.metrics import metric as metric_facts
-from hwp_bench.report.figures import draw_pareto, inline_svg
+from hwp_bench.report.figures import bands_text, draw_pareto, inline_svg
 from hwp_bench.report.page import provenance, render_template, style_sheet, write_report
 from hwp_bench.report.sources import ResultsSource, open_captures_of
 from hwp_bench.report.study_tables import METRIC
@@ -294,8 +294,8 @@ def curve_plot(rows: Sequence[BoardRow]) -> dict[str, Any] | None:
 
     Returns:
         The plot (`figure`), the labels of the methods in the order of their colours (`methods`),
-        and of those on the Pareto front for some time (`front`). None where no whole row left a
-        curve, or where one submitted twice cannot be told apart.
+        of those on the Pareto front for some time (`front`), and what the bands are (`bands`).
+        None where no whole row left a curve, or where one submitted twice cannot be told apart.
     """
     whole = sorted((row for row in rows if row.whole), key=lambda row: -row.scores[METRIC])
     try:
@@ -310,7 +310,8 @@ def curve_plot(rows: Sequence[BoardRow]) -> dict[str, Any] | None:
     figure = inline_svg(draw_pareto(cost.curves, cost.front, METRIC, order), title)
     leading = {part.label for part in cost.front}
     front = [label for label in order if label in leading]
-    return {"figure": figure, "methods": list(order), "front": front}
+    bands = bands_text(cost.curves)
+    return {"figure": figure, "methods": list(order), "front": front, "bands": bands}
 
 
 def _scores_json(row: BoardRow, metric: str) -> str:

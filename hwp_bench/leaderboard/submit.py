@@ -23,13 +23,14 @@ from hwp_bench.leaderboard.entries import (
 )
 from hwp_bench.leaderboard.rules import (
     HEADLINE,
+    check_bound,
     check_complete,
     check_current,
     check_entries,
     current,
     register,
+    sound_entries,
 )
-from hwp_bench.leaderboard.soundness import check_bound, sound_entries
 from hwp_bench.leaderboard.suite_data import on_current_data
 from hwp_bench.report.sources import ResultsSource
 from hwp_bench.results import Results, read_results

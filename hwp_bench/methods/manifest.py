@@ -122,6 +122,21 @@ class Switch:
 
 
 @dataclass(frozen=True)
+class Base:
+    """A simpler form of a method that ablations may start from, such as that of its paper."""
+
+    #: Short name, as a switch's; the file has it as the name of the table.
+    name: str
+    #: Settings that make it, in every variant.
+    settings: _SwitchSettings
+    #: Names of the components that are crossed when nothing is asked for.
+    crossed: Annotated[list[_SwitchName], Meta(min_length=1, max_length=4)]
+    description: Line = ""
+    #: Names of the other components that are in it; those not named are out of every variant.
+    kept: list[_SwitchName] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
 class ManifestFields:
     """The fields of a `method.toml`, but for its schema; what is empty the file does not say."""
 
@@ -150,6 +165,8 @@ class ManifestFields:
     switches: dict[_SwitchName, Switch] = field(default_factory=dict)
     #: Names of the components that an ablation crosses when nothing is asked for.
     crossed: Annotated[list[_SwitchName], Meta(max_length=4)] = field(default_factory=list)
+    #: What else an ablation may start from (`--base`), by name.
+    bases: dict[_SwitchName, Base] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -286,9 +303,10 @@ def read_manifest(path: str | os.PathLike[str]) -> MethodManifest:
         fields["authors"] = ", ".join(authors)
     if isinstance(fields.get("settings"), str):
         fields["settings"] = [fields["settings"]]
-    switches = fields.get("switches")
-    if isinstance(switches, dict) and all(isinstance(item, dict) for item in switches.values()):
-        fields["switches"] = {name: {**item, "name": name} for name, item in switches.items()}
+    for kind in ("switches", "bases"):
+        found = fields.get(kind)
+        if isinstance(found, dict) and all(isinstance(item, dict) for item in found.values()):
+            fields[kind] = {name: {**item, "name": name} for name, item in found.items()}
     table = parse_record(ManifestFields, fields, where=where, error=BadMethod)
     names: list[str] = []
     for item in table.settings:
@@ -304,6 +322,7 @@ def read_manifest(path: str | os.PathLike[str]) -> MethodManifest:
     for name, switch in manifest.switches.items():
         kind = "settings_on" if switch.alternative else "settings_off"
         tables[f"switches.{name}.{kind}"] = switch.settings
+    tables |= {f"bases.{name}.settings": base.settings for name, base in manifest.bases.items()}
     for place, values in tables.items():
         check_json_values(values, where=where, field=place, error=BadMethod)
         manifest.check_setting_names(values, place)
@@ -312,21 +331,25 @@ def read_manifest(path: str | os.PathLike[str]) -> MethodManifest:
 
 
 def _check_switches(manifest: MethodManifest, where: Path) -> None:
-    """Refuse variants of one name, and names in `crossed` of no component, or there twice."""
+    """Refuse variants of one name; where components are named, any other name, and one twice."""
     variants = [switch.variant_name for switch in manifest.switches.values()]
     for name in variants:
         if variants.count(name) > 1:
             raise BadMethod(f"two switches make a variant {name!r}", where=where, field="switches")
     components = [item.name for item in manifest.switches.values() if not item.alternative]
-    for name in manifest.crossed:
-        if name not in components or manifest.crossed.count(name) > 1:
-            twice = "there twice" if name in components else "not a component"
-            raise BadMethod(
-                f"{name!r} is {twice}",
-                where=where,
-                field="crossed",
-                remedy=f"Name each of these at most once: {', '.join(components) or 'none'}.",
-            )
+    lists = {"crossed": manifest.crossed}
+    for base in manifest.bases.values():
+        lists[f"bases.{base.name}"] = [*base.crossed, *base.kept]
+    for place, names in lists.items():
+        for name in names:
+            if name not in components or names.count(name) > 1:
+                twice = "there twice" if name in components else "not a component"
+                raise BadMethod(
+                    f"{name!r} is {twice}",
+                    where=where,
+                    field=place,
+                    remedy=f"Name each of these at most once: {', '.join(components) or 'none'}.",
+                )
 
 
 def find_setting_files(

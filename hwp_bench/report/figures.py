@@ -23,7 +23,7 @@ from markupsafe import Markup
 
 from hwp_bench.analysis.bootstrap import Estimate, bootstrap_mean
 from hwp_bench.analysis.cost import CostAnalysis
-from hwp_bench.analysis.curves import FrontPart, MeanCurve
+from hwp_bench.analysis.curves import LEAST_CAPTURES, FrontPart, MeanCurve
 from hwp_bench.analysis.pairing import MethodRuns, scopes
 from hwp_bench.base.files import atomic_write
 from hwp_bench.base.tables import write_tables
@@ -198,13 +198,21 @@ def draw_pareto(
         better = "" if facts.higher_is_better else ", lower is better"
         heading(axes, f"{facts.label}{unit}, validation frames{better}")
         if names:
-            banded = any(curve.low is not None for curve in curves)
-            title = "Bands: 95 % interval over captures" if banded else None
+            title = bands_text(curves)
+            title = title[0].upper() + title[1:]
             figure.legend(
                 loc="lower left", frameon=False, fontsize=9, title=title, title_fontsize=9,
                 alignment="left", handlelength=4,
             )  # fmt: skip
     return figure
+
+
+def bands_text(curves: Sequence[MeanCurve]) -> str:
+    """Say what the bands of `draw_pareto` are, or why there are none."""
+    if all(curve.low is None for curve in curves):
+        return f"no intervals: of fewer than {LEAST_CAPTURES} captures they say nothing"
+    some = " of the methods on the front" if len(curves) > _BANDS else ""
+    return f"shaded bands are 95 % intervals over captures{some}"
 
 
 def _seconds_axis(axes: Axes, start: float, stop: float) -> None:

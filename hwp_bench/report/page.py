@@ -28,6 +28,7 @@ from hwp_bench.capture.schema import CaptureInfo
 from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.report.figures import (
     StripMethod,
+    bands_text,
     bars_by_perturbation,
     draw_pareto,
     inline_svg,
@@ -200,6 +201,7 @@ def gather_report(
         "methods": [run.label for run in runs],
         "tables": noted(shown),
         "pareto": _pareto(cost, runs) if cost else None,
+        "bands": bands_text(cost.curves) if cost else "",
         "cost_tables": noted(cost.tables.values() if cost else ()),
         "bars": bars_by_perturbation(runs, HEADLINE),
         "differences": noted(_optional(lambda: _differences(runs)) or ()),

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.stats import spearmanr
 
 from hwp_bench.base.console import track
 from hwp_bench.base.drawing import labelled, sheet
@@ -155,6 +154,9 @@ def temporal_weights(
     Severity is the sum of the levels of all perturbations. The correlation (Spearman's) is None
     where a level is not known, or where all frames have the same severity or weight.
     """
+    # Imported here: it takes half a second, which every command and fit would wait for.
+    from scipy.stats import spearmanr
+
     frames, found = avatar.record.frames, {}
     levels = [[*capture.info.severity(frame).values()] for frame in frames]
     known = all(level is not None for each in levels for level in each)

@@ -32,6 +32,9 @@ _PASSES = 10
 _SECOND_OFF, _SECOND_SHARE = 0.7, 0.03
 # Distance from the skin colour at which a cell counts half in it.
 _SKIN_SCALE = 0.3
+# A frame shows another side of the hand where at most this share of its samples lies in cells that
+# frames of ordinary light show, and at least so many, which tell its light.
+_OTHER_SIDE, _TELLING = 0.5, 10
 
 
 def log_light_table() -> np.ndarray:
@@ -102,14 +105,56 @@ def fit_intensity(
     """Fit albedo, shading and gains by turns, with weights that leave outliers out.
 
     Without a verdict a place that looks like no other one is an outlier, because an object may
-    cover it in every frame that shows it. With one, what clean frames show of a place is how it
-    looks: a bare finger of a glove, a palm of another colour.
+    cover it in every frame that shows it, and a frame that shows such places alone is one of other
+    light. But the palms of dark skin are far lighter than the backs. Frames of the palm show the
+    sides of fingers too, and where these are as bright as ever, the light is ordinary: the model is
+    fitted again, with these frames' gains held at 0. With a verdict, what clean frames show of a
+    place is how it looks: a bare finger of a glove, a palm of another colour.
 
     Args:
         samples: at least one.
         cell_normals: (C, 3) normal of every cell on the rest surface; zeros where unknown.
         verdict: on the frames of the samples.
     """
+    model = _fit(samples, cell_normals, verdict, None)
+    if verdict is not None:
+        return model
+    held = _in_ordinary_light(samples, model)
+    return _fit(samples, cell_normals, None, held) if held.any() else model
+
+
+def _in_ordinary_light(samples: IntensitySamples, model: IntensityModel) -> np.ndarray:
+    """(R,) bool: frames of another side of the hand, of large gain, but not where others look."""
+    counts = np.diff(samples.starts)
+    rows = np.repeat(np.arange(len(counts)), counts)
+    far = np.linalg.norm(model.gains, axis=1) > _FRAME_SCALE
+    usual = ~far[rows]
+    count = len(model.albedo)
+    shown = np.unique(np.stack([samples.cells[usual], rows[usual]]), axis=1)[0]
+    told = np.bincount(shown, minlength=count) > 1
+    unlit = samples.light - samples.basis @ model.shading
+    mass = np.maximum(np.bincount(samples.cells[usual], minlength=count), 1)
+    albedo = np.stack(
+        [np.bincount(samples.cells[usual], unlit[usual, k], minlength=count) for k in range(3)], 1
+    )
+    rest = unlit - (albedo / mass[:, None])[samples.cells]
+    held = np.zeros(len(counts), dtype=bool)
+    for row in np.flatnonzero(far):
+        part = slice(samples.starts[row], samples.starts[row + 1])
+        telling = told[samples.cells[part]]
+        if telling.sum() >= _TELLING and telling.mean() <= _OTHER_SIDE:
+            gain = np.median(rest[part][telling], axis=0)
+            held[row] = np.linalg.norm(gain) < _FRAME_SCALE
+    return held
+
+
+def _fit(
+    samples: IntensitySamples,
+    cell_normals: np.ndarray,
+    verdict: Verdict | None,
+    held: np.ndarray | None,
+) -> IntensityModel:
+    """See `fit_intensity`; the gains of held frames, (R,) bool, stay 0."""
     counts = np.diff(samples.starts)
     rows = np.repeat(np.arange(len(counts)), counts)
     cell_count = len(cell_normals)
@@ -129,6 +174,10 @@ def fit_intensity(
         known = _known_cells(verdict.clean, cells, rows, len(used))
         # Squared: doubtful frames count little, because they may all show the same object.
         sure = np.where(known[cells], verdict.clean[rows] ** 2, 1.0)
+    elif held is not None:
+        # What others do not show is what it looks like here.
+        others = np.bincount(cells[~held[rows]], minlength=len(used))
+        known = np.bincount(cells[held[rows]], minlength=len(used)) > others
     prior = np.where(known, _KNOWN_PRIOR, _PRIOR)
     shade = np.zeros_like(light)
     scale = 1.0
@@ -146,10 +195,12 @@ def fit_intensity(
         gains = _frame_medians(rest, samples.starts)
         centre, part = densest(gains, CLEAN_SHARE)
         gains = gains - centre
+        if held is not None:
+            gains[held] = 0.0
         residual = np.abs(rest - centre - gains[rows]) @ np.full(3, 1.0 / 3.0)
         scale = max(float(np.median(residual[part[rows]])), 0.01)
         ordinary: float | np.ndarray = scale
-        if verdict is not None:
+        if known.any():
             ordinary = _cell_scales(cells, residual, sure * known[cells], len(used), scale)[cells]
         weights = 1.0 / (1.0 + (residual / (2.5 * ordinary)) ** 4)
     everywhere = np.column_stack([np.ones(cell_count), shading_basis(cell_normals)])
@@ -157,7 +208,7 @@ def fit_intensity(
     full = smooth.copy()
     full[used] = albedo + centre
     shown = np.zeros(cell_count, dtype=bool)
-    shown[used] = known
+    shown[used] = known & (verdict is not None)
     second = _second_colour(full[shown], smooth[shown])
     return IntensityModel(
         full, smooth, shading.astype(np.float32), gains, scale, known=shown, second=second

@@ -18,10 +18,12 @@ from hwp_bench.analysis.compare import (
     contrasts,
     macro_by_seed,
     one_capture_notes,
+    scope_title,
 )
 from hwp_bench.analysis.cost import seconds_table
 from hwp_bench.analysis.pairing import MethodRuns, common_metrics, scopes
 from hwp_bench.base.files import write_json
+from hwp_bench.base.records import flattened
 from hwp_bench.base.tables import Column, Table, to_object
 from hwp_bench.evaluation.ablate.runs import AblationEffect, AblationRuns, result_folder
 from hwp_bench.metrics import metric as metric_facts
@@ -35,7 +37,10 @@ from hwp_bench.taxonomy import PERTURBATIONS
 #: The times that are compared, with what each is of.
 QUANTITIES = {"step": "optimizer step", "fit": "whole fit", "render": "rendered frame"}
 _YES, _NO = "yes", "–"
-_GROUPS = {"single": "Single", "interacting": "Interacting", "macro": "Macro"}
+#: Tables that the command prints; all are written.
+PRINTED = ("ablation", "perturbations", "gains", "component_cost")
+#: Scopes of the first table; each perturbation is one of the second.
+_GROUPS = ("single", "interacting", "macro")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,19 +176,24 @@ def ablation_tables(
 ) -> dict[str, Table]:
     """Return every table of an ablation, by name.
 
-    `ablation` (a row a variant: the paper's columns, and the time), `paper` (the same in the
-    protocol paper-wildghand), `effects`, `effects_perturbations`, `component_cost`, `seeds`,
-    `seconds` (where those of all runs went).
+    `ablation` (a row a variant: the paper's columns, and the time), `perturbations` (its scores by
+    perturbation), `paper` (as `ablation`, in the protocol paper-wildghand), `gains` (a row an
+    effect, in PSNR), `effects`, `effects_perturbations`, `component_cost`, `seeds`, `seconds`
+    (where those of all runs went).
     """
     runs = list(ablation.runs.values())
     headline = common_metrics(runs, HEADLINE)
     tables = {
         "ablation": variant_table(ablation, headline),
+        "gains": gain_table([item for item in effects if item.metric == HEADLINE[0]]),
         "effects": effect_table([item for item in effects if item.scope not in PERTURBATIONS]),
         "effects_perturbations": effect_table([e for e in effects if e.scope in PERTURBATIONS]),
         "component_cost": cost_table(costs),
         "seeds": seed_table(ablation, headline),
     }
+    by_perturbation = perturbation_table(ablation, headline)
+    if any(column.group for column in by_perturbation.columns):
+        tables["perturbations"] = by_perturbation
     if paper := common_metrics(runs, PAPER):
         tables["paper"] = variant_table(ablation, paper)
     if (spent := seconds_table(runs)) is not None:
@@ -193,31 +203,15 @@ def ablation_tables(
 
 def variant_table(ablation: AblationRuns, metrics: Sequence[str]) -> Table:
     """Return one row a variant: what is in it, mean scores over seeds, and what it took."""
-    design = ablation.design
-    variants = [(variant, ablation.runs[variant.name]) for variant in design.variants]
-    means = [_means(run) for _, run in variants]
-    columns: list[Filled] = [
-        (
-            Column(item.title),
-            [_YES if (item.name in v.thrown) == item.alternative else _NO for v, _ in variants],
-        )
-        for item in (*design.components, *design.alternatives)
-    ]
-    columns += [
-        (score_column(name, title), [mean.get(group, {}).get(name) for mean in means])
-        for group, title in _GROUPS.items()
-        if any(group in mean for mean in means)
-        for name in metrics
-    ]
-    columns += [
-        (
-            Column("Step [ms]", 1, group="Time"),
-            [_mean_time(run, "step", 1e3) for _, run in variants],
-        ),
-        (Column("Fit [s]", 1, group="Time"), [_mean_time(run, "fit") for _, run in variants]),
+    runs = list(ablation.runs.values())
+    columns = [
+        *_component_columns(ablation),
+        *_score_columns(ablation, metrics, _GROUPS),
+        (Column("Step [ms]", 1, group="Time"), [_mean_time(run, "step", 1e3) for run in runs]),
+        (Column("Fit [s]", 1, group="Time"), [_mean_time(run, "fit") for run in runs]),
         (
             Column("Failed frames", 0),
-            [sum(capture.failed_frames for capture in _captures(run)) for _, run in variants],
+            [sum(capture.failed_frames for capture in _captures(run)) for run in runs],
         ),
     ]
     first = ablation.any_run.first
@@ -228,7 +222,60 @@ def variant_table(ablation: AblationRuns, metrics: Sequence[str]) -> Table:
         f"{metric_facts(metrics[0]).protocol}; means over captures of means over test frames, then "
         "over seeds. Step and fit: means over captures and seeds, on the method's own clock."
     )
-    return table_of("Ablation", columns, [note])
+    return table_of("Ablation", columns, [base_text(ablation), note])
+
+
+def base_text(ablation: AblationRuns) -> str:
+    """Say in one line what the first row is: what is out of it, and what all rows keep."""
+    design = ablation.design
+    settings = dict(flattened(ablation.any_run.first.method.settings))
+    # What a setting of the preset or the command line turns off stays in nowhere.
+    kept = [
+        item.name
+        for item in design.kept
+        if any(settings.get(name) != value for name, value in item.settings.items())
+    ]
+    first = design.variants[0]
+    parts = [f"Base row: {design.base.name if design.base else 'the method'} {first.title}".strip()]
+    parts.append(f"keeps {', '.join(kept) or 'no other component'}, as all rows do")
+    if ablation.settings:
+        given = ", ".join(f"{name}={value}" for name, value in flattened(ablation.settings))
+        parts.append(f"set in all rows: {given}")
+    return "; ".join(parts) + "."
+
+
+def perturbation_table(ablation: AblationRuns, metrics: Sequence[str]) -> Table:
+    """Return one row a variant: its scores by perturbation, means over seeds."""
+    columns = [
+        *_component_columns(ablation),
+        *_score_columns(ablation, metrics[:3], PERTURBATIONS),
+    ]
+    note = "Mean over the captures with the perturbation; a capture may have several."
+    return table_of("Ablation by perturbation", columns, [note])
+
+
+def _component_columns(ablation: AblationRuns) -> list[Filled]:
+    design = ablation.design
+    return [
+        (
+            Column(item.title),
+            [_YES if (item.name in v.thrown) == item.alternative else _NO for v in design.variants],
+        )
+        for item in (*design.components, *design.alternatives)
+    ]
+
+
+def _score_columns(
+    ablation: AblationRuns, metrics: Sequence[str], groups: Sequence[str]
+) -> list[Filled]:
+    """Return a group of columns for each scope that the captures have."""
+    means = [_means(run) for run in ablation.runs.values()]
+    return [
+        (score_column(name, scope_title(group)), [mean.get(group, {}).get(name) for mean in means])
+        for group in groups
+        if any(group in mean for mean in means)
+        for name in metrics
+    ]
 
 
 def _means(run: MethodRuns) -> dict[str, Scores]:
@@ -236,11 +283,12 @@ def _means(run: MethodRuns) -> dict[str, Scores]:
     found: dict[str, list[Scores]] = {}
     for result in run.seeds.values():
         mean = aggregate(score_rows(result))
+        own = {"macro": mean.overall.macro, **mean.overall.perturbations}
         for scope, summary in (("single", mean.single), ("interacting", mean.interacting)):
-            if summary:
-                found.setdefault(scope, []).append(summary.capture_mean)
-        if mean.overall.macro:
-            found.setdefault("macro", []).append(mean.overall.macro)
+            own[scope] = summary.capture_mean if summary else {}
+        for scope, scores in own.items():
+            if scores:
+                found.setdefault(scope, []).append(scores)
     return {
         scope: {name: sum(row[name] for row in rows) / len(rows) for name in rows[0]}
         for scope, rows in found.items()
@@ -256,6 +304,52 @@ def _mean_time(run: MethodRuns, quantity: str, factor: float = 1.0) -> float | N
     return factor * sum(spent) / len(spent) if spent else None
 
 
+#: What the kinds of effects are, for a line under a table.
+_KINDS = {
+    "main": "score with the component less score without it, mean over the other components "
+    "in and out",
+    "interaction": "what two bring together beyond the sum of what each brings alone",
+    "out": "the full method less the one without",
+    "alternative": "the method less the one with the alternative",
+}
+_INTERVAL = (
+    "95 % intervals: paired bootstrap over captures, then seeds and blocks of frames, read with "
+    "Student's t (docs/statistics.md)."
+)
+
+
+def _kinds_note(effects: Sequence[ScoreEffect]) -> str:
+    kinds = dict.fromkeys(item.kind for item in effects)
+    return "; ".join(f"{kind}: {_KINDS[kind]}" for kind in kinds) + "."
+
+
+def gain_table(effects: Sequence[ScoreEffect]) -> Table:
+    """Return one row an effect, and a group of columns for each scope: gain and interval.
+
+    All effects are in one metric.
+    """
+    facts = metric_facts(effects[0].metric)
+    found = {(item.effect, item.kind, item.scope): item for item in effects}
+    rows = list(dict.fromkeys((effect, kind) for effect, kind, _ in found))
+    columns: list[Filled] = [(Column("Effect"), [effect for effect, _ in rows])]
+    if {"main", "out"} <= {kind for _, kind in rows}:
+        columns.append((Column("Kind"), [kind for _, kind in rows]))
+    for scope in dict.fromkeys(item.scope for item in effects):
+        own = [found[effect, kind, scope] for effect, kind in rows]
+        title = f"{scope_title(scope)} ({own[0].estimate.captures})"
+        columns += [
+            (Column(name, facts.digits, group=title), [getattr(i.estimate, field) for i in own])
+            for name, field in (("Gain", "value"), ("Low", "low"), ("High", "high"))
+        ]
+    unit = f", {facts.unit}" if facts.unit else ""
+    notes = [
+        f"{facts.label}{unit}; in brackets the captures. {_kinds_note(effects)}",
+        _INTERVAL,
+        *one_capture_notes(effects),
+    ]
+    return table_of("Gains", columns, notes)
+
+
 def effect_table(effects: Sequence[ScoreEffect]) -> Table:
     """Return one row an effect, metric and scope."""
     columns: list[Filled] = [
@@ -266,13 +360,9 @@ def effect_table(effects: Sequence[ScoreEffect]) -> Table:
         *contrast_columns(effects, "ssim", "P(better)"),
     ]
     notes = (
-        "main: score with the component less score without it, mean over the other components "
-        "in and out; interaction: what two bring together beyond the sum of what each brings "
-        "alone; out: the full method less the one without; alternative: the method less the one "
-        "with the alternative.",
-        "95 % intervals: paired bootstrap over captures, then seeds and blocks of frames, read "
-        "with Student's t (docs/statistics.md). p (Holm): over the perturbations. Detectable: the "
-        "true effect that such an ablation finds with 80 % probability.",
+        _kinds_note(effects),
+        f"{_INTERVAL} p (Holm): over the perturbations. Detectable: the true effect that such an "
+        "ablation finds with 80 % probability.",
         *one_capture_notes(effects),
     )
     return table_of("Effects", columns, notes)
@@ -324,6 +414,8 @@ def ablation_record(
         "schema": ABLATION_SCHEMA,
         "method": {"name": first.method.name, "digest": first.method.digest},
         "preset": first.method.preset,
+        "base": design.base.name if design.base else None,
+        "kept": [item.name for item in design.kept],
         "suite": first.suite,
         "budget": first.budget,
         "frames": first.frames,

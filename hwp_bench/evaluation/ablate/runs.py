@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations, product
 from pathlib import Path
 from typing import Any, Unpack
@@ -12,15 +12,9 @@ from hwp_bench.analysis.pairing import MethodRuns
 from hwp_bench.base.errors import UsageError, did_you_mean
 from hwp_bench.capture.splits import Split
 from hwp_bench.commitments.publication import open_captures
-from hwp_bench.evaluation.evaluate import (
-    EvaluationSettings,
-    How,
-    OnCapture,
-    make_plan,
-    run_plans,
-    with_setting_files,
-)
-from hwp_bench.methods.manifest import MANIFEST, MethodManifest, Switch
+from hwp_bench.evaluation.capture_evaluation import EvaluationSettings
+from hwp_bench.evaluation.evaluate import How, OnCapture, make_plan, run_plans, with_setting_files
+from hwp_bench.methods.manifest import MANIFEST, Base, MethodManifest, Switch
 from hwp_bench.metrics.lpips import load_available
 from hwp_bench.results import Results
 
@@ -71,15 +65,22 @@ class Design:
     #: Variants, the barest first, the full method last before the alternatives.
     variants: tuple[Variant, ...]
     effects: tuple[AblationEffect, ...]
+    #: Components that all variants have.
+    kept: tuple[Switch, ...] = ()
+    #: What it starts from in place of the method as it is; None for that.
+    base: Base | None = None
 
 
 def make_design(
-    manifest: MethodManifest, thrown: Sequence[str] = (), crossed: Sequence[str] = ()
+    manifest: MethodManifest,
+    thrown: Sequence[str] = (),
+    crossed: Sequence[str] = (),
+    base: str | None = None,
 ) -> Design:
     """Choose the variants.
 
-    Without names those components are crossed that the method names for it, or else the first two
-    that it declares: 2^k variants.
+    Without names those components are crossed that the method, or the base, names for it, or else
+    the first two that the method declares: 2^k variants.
     `crossed` crosses the named components instead: 2^k variants. `thrown` asks what each named
     switch does to the full method: the full method, the method with only one of them thrown,
     and, of two components or more, with all of them out. (With two that is the 2 x 2 again.)
@@ -89,9 +90,19 @@ def make_design(
             "components are either crossed or taken out one by one", remedy="Leave one out."
         )
     switches = [_switch(manifest, name) for name in dict.fromkeys([*thrown, *crossed])]
+    start = None if base is None else _base(manifest, base)
+    declared = [item for item in manifest.switches.values() if not item.alternative]
+    if start is not None:
+        declared = [item for item in declared if item.name in (*start.crossed, *start.kept)]
+        for item in switches:
+            if not item.alternative and item not in declared:
+                raise UsageError(
+                    f"{item.name!r} is out of every variant",
+                    field="--base",
+                    remedy=f"In {base!r} are: {', '.join(one.name for one in declared)}.",
+                )
     if not switches:
-        declared = [item for item in manifest.switches.values() if not item.alternative]
-        named = [manifest.switches[name] for name in manifest.crossed]
+        named = [manifest.switches[name] for name in (start or manifest).crossed]
         switches = named or declared[:DEFAULT_FACTORS]
         crossed = [item.name for item in switches]
         if not switches:
@@ -119,7 +130,20 @@ def make_design(
         variants.append(_variant((alternative,)))
         contrast = {FULL: 1.0, alternative.variant_name: -1.0}
         effects.append(AblationEffect(f"not {alternative.title}", "alternative", contrast))
-    return Design(components, alternatives, tuple(variants), tuple(effects))
+    kept = tuple(item for item in declared if item not in components)
+    return Design(components, alternatives, tuple(variants), tuple(effects), kept, start)
+
+
+def _base(manifest: MethodManifest, name: str) -> Base:
+    if name in manifest.bases:
+        return manifest.bases[name]
+    known = ", ".join(manifest.bases) or "none"
+    raise UsageError(
+        f"{manifest.name} has no base {name!r}",
+        where=manifest.root / MANIFEST,
+        field="bases",
+        remedy=f"It declares: {known}.",
+    )
 
 
 def _switch(manifest: MethodManifest, name: str) -> Switch:
@@ -183,6 +207,8 @@ class AblationRuns:
     design: Design
     #: The evaluations by variant, in the design's order.
     runs: Mapping[str, MethodRuns]
+    #: Settings that a person gave to all variants.
+    settings: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def any_run(self) -> MethodRuns:
@@ -220,23 +246,26 @@ def run_ablation(
     the variants are then timed under the same load, and whenever the run is stopped, all have
     been given the same captures. Which variant goes first changes from capture to capture.
     """
+    given = settings.run.settings
     settings = with_setting_files(manifest, settings)
     opened = open_captures(captures, splits)
     networks = load_available()
     plans, order = {}, []
+    start = design.base.settings if design.base else {}
+    name = f"{manifest.title} ({design.base.name})" if design.base else manifest.title
     for seed in seeds:
         for variant in design.variants:
-            chosen = {**settings.run.settings, **variant.settings}
+            chosen = {**start, **settings.run.settings, **variant.settings}
             plans[result_folder(variant.name, seed)] = make_plan(
-                replace(manifest, title=f"{manifest.title} {variant.title}".strip()),
+                replace(manifest, title=f"{name} {variant.title}".strip()),
                 opened,
                 replace(settings, run=replace(settings.run, settings=chosen, seed=seed)),
                 networks,
                 f"{variant.name}, seed {seed}",
             )
         for number in range(len(opened)):
-            start = (number + seed) % len(design.variants)
-            turned = (*design.variants[start:], *design.variants[:start])
+            first = (number + seed) % len(design.variants)
+            turned = (*design.variants[first:], *design.variants[:first])
             order += [(result_folder(variant.name, seed), number) for variant in turned]
     results = run_plans(out, plans, order, on_start=on_job, tables=False, **how)
     runs = {}
@@ -244,4 +273,4 @@ def run_ablation(
         by_seed = {seed: results[result_folder(variant.name, seed)] for seed in seeds}
         title = plans[result_folder(variant.name, seeds[0])].manifest.title
         runs[variant.name] = MethodRuns(title, by_seed)
-    return AblationRuns(design, runs)
+    return AblationRuns(design, runs, given)

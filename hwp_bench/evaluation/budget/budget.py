@@ -20,7 +20,8 @@ from hwp_bench.evaluation.budget.corrections import CORRECTIONS
 from hwp_bench.evaluation.budget.surface import NAME as CEILING
 from hwp_bench.evaluation.budget.surface import TEXT as CEILING_TEXT
 from hwp_bench.evaluation.budget.surface import Ceiling, Pair, error_of, pairs_of
-from hwp_bench.evaluation.evaluate import EvaluationSettings, How, OnCapture, evaluate
+from hwp_bench.evaluation.capture_evaluation import EvaluationSettings
+from hwp_bench.evaluation.evaluate import How, OnCapture, evaluate
 from hwp_bench.methods.contract import FRAME_CHOICES
 from hwp_bench.methods.request import ORACLE_INPUTS, frame_choice, known_oracle_inputs
 from hwp_bench.metrics.pixels import decibels

@@ -149,7 +149,8 @@ def test_the_band_is_students_interval_over_captures() -> None:
     curve = mean_curve("mine", curves)
     low, high = stats.t.interval(0.95, 2, np.mean(finals), stats.sem(finals))
     assert (curve.low[-1], curve.high[-1]) == (pytest.approx(low), pytest.approx(high))
-    assert mean_curve("mine", {"c": [CURVE]}).low is None
+    for few in ({"c": [CURVE]}, {"c": [CURVE], "d": [CURVE]}):
+        assert mean_curve("mine", few).low is None
     assert mean_curve("mine", {}) is None
 
 

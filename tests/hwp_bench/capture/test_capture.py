@@ -26,6 +26,7 @@ from hwp_bench.base.errors import (
 from hwp_bench.capture import Cameras, Capture, CaptureWriter, open_capture
 from hwp_bench.capture.check import check_capture, mesh_problems
 from hwp_bench.capture.schema import read_subject_mesh, write_subject_mesh
+from hwp_bench.cli.main import main
 from hwp_bench.hands import HandTemplate, load_template, mirror_template
 from hwp_bench.hands.template import rebuilt
 from hwp_bench.metrics.score import score_frame
@@ -374,3 +375,27 @@ def test_a_damaged_file_is_refused(path: Path, field: str, spoilt, reason: str) 
     write_npz(path, arrays | {f"right_{field}": spoilt(arrays[f"right_{field}"])})
     with pytest.raises(BadInput, match=reason):
         read_subject_mesh(path, load_template("anny", "right"))
+
+
+@pytest.mark.parametrize(
+    ("declared", "said"),
+    [({}, "unknown"), ({"motion_blur": None}, "motion_blur unknown"), (None, "motion_blur 5")],
+)
+def test_frames_of_unknown_perturbations_are_unknown(
+    declared, said: str, make_capture: CaptureMaker, capsys
+) -> None:
+    capture = make_capture(perturbations=declared)
+    assert main(["data", "check", str(capture.root)]) == 0
+    row = next(line for line in capsys.readouterr().out.splitlines() if "perturbed_frames" in line)
+    assert row.split(maxsplit=1)[1].strip() == said
+    value = check_capture(capture.root).facts["perturbed_frames"]
+    assert value == {"unknown": None, "motion_blur unknown": {"motion_blur": None}}.get(
+        said, {"motion_blur": 5}
+    )
+
+
+def test_a_simulated_capture_without_effects_has_none(make_capture: CaptureMaker) -> None:
+    from hwp_bench.capture.check import _perturbed_frames
+
+    info = make_capture(perturbations={}).info
+    assert _perturbed_frames(replace(info, source={"kind": "simulated"})) == {}

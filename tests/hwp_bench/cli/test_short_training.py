@@ -11,25 +11,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from small_captures import split_file
 
-from hwp_bench.base.files import sha256_json
 from hwp_bench.capture import Capture
 from hwp_bench.cli.main import main
 
 PLAIN = str(Path(__file__).parents[3] / "baselines" / "plain")
-
-
-def split_file(path: Path, capture: str, train: list[int], frames: int) -> str:
-    content = {
-        "capture": capture,
-        "frame_count": frames,
-        "train": train,
-        "validation": [frames - 3, frames - 2],
-        "test": [frames - 2, frames],
-    }
-    split = {**content, "digest": sha256_json(content)}
-    path.write_text(json.dumps({"schema": "hwp-splits/1", "splits": [split]}))
-    return str(path)
 
 
 def evaluate(capture: Capture, train: list[int], folder: Path) -> tuple[int, Path]:

@@ -15,7 +15,9 @@ from hwp_bench.base.errors import BadCapture, BadImage, BadSplit, UsageError
 from hwp_bench.base.images import write_image
 from hwp_bench.capture import Capture
 from hwp_bench.capture.splits import contiguous_split
-from hwp_bench.evaluation.evaluate import EvaluationSettings, default_folder, evaluate
+from hwp_bench.cli.main import main
+from hwp_bench.evaluation.capture_evaluation import EvaluationSettings
+from hwp_bench.evaluation.evaluate import default_folder, evaluate
 from hwp_bench.methods.contract import Budget, RunSettings
 from hwp_bench.metrics import METRICS, metric, penalty
 from hwp_bench.results import Results, read_results
@@ -51,6 +53,18 @@ def captures(make_capture: CaptureMaker) -> list[Capture]:
         make_capture("single", frames=20, size=48, truth=True),
         make_capture("pair", frames=20, size=48, hands="both"),
     ]
+
+
+def test_the_command_prints_scores_by_perturbation(captures, tmp_path: Path, capsys) -> None:
+    # The small captures have motion blur and nothing else.
+    entry = submission(tmp_path / "entry", captures)
+    words = ["evaluate", str(entry), "--capture", *(str(one.root) for one in captures)]
+    assert main([*words, "-o", str(tmp_path / "out")]) == 0
+    shown = capsys.readouterr().out
+    places = [shown.index(text) for text in ("All captures", "Per perturbation", "Per capture")]
+    assert places == sorted(places)
+    assert "Motion Blur" in shown[places[1] : places[2]]
+    assert "Illumination" not in shown
 
 
 def test_the_ground_truth_scores_perfectly_in_every_metric(captures, tmp_path: Path) -> None:

@@ -20,8 +20,8 @@ from hwp_bench.capture.check import check_capture
 from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.cli.main import main
 from hwp_bench.commitments import open_sealed, publish
-from hwp_bench.evaluation.capture_evaluation import CaptureEvaluation
-from hwp_bench.evaluation.evaluate import EvaluationSettings, evaluate
+from hwp_bench.evaluation.capture_evaluation import CaptureEvaluation, EvaluationSettings
+from hwp_bench.evaluation.evaluate import evaluate
 from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.manifest import read_manifest
 from hwp_bench.methods.request import open_request, write_request
@@ -219,7 +219,7 @@ def test_the_key_follows_the_clip(
     split = contiguous_split("tiny", 20)
 
     def key(item: Capture) -> str:
-        return CaptureEvaluation(manifest, item, split, RunSettings({})).key
+        return CaptureEvaluation(manifest, item, split, EvaluationSettings()).key
 
     first = key(capture)
     shutil.rmtree(capture.root / "free")

@@ -23,7 +23,8 @@ from benchmarks.patience import Patience, spent_by
 from hwp_bench.base.errors import BadMethod, UsageError
 from hwp_bench.capture import Capture
 from hwp_bench.cli.main import main
-from hwp_bench.evaluation.evaluate import EvaluationSettings, evaluate
+from hwp_bench.evaluation.capture_evaluation import EvaluationSettings
+from hwp_bench.evaluation.evaluate import evaluate
 from hwp_bench.evaluation.verify import verify_results
 from hwp_bench.methods.contract import Budget, RunSettings
 from hwp_bench.results import Results

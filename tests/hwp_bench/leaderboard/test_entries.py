@@ -34,6 +34,7 @@ from hwp_bench.leaderboard.entries import (
     write_entry,
 )
 from hwp_bench.leaderboard.rules import (
+    check_bound,
     check_complete,
     check_entries,
     check_unchanged,
@@ -41,7 +42,6 @@ from hwp_bench.leaderboard.rules import (
     history,
     tables_of,
 )
-from hwp_bench.leaderboard.soundness import check_bound
 from hwp_bench.leaderboard.submit import add_entry
 from hwp_bench.metrics import PROTOCOLS
 from hwp_bench.results import FrameResult, Results, write_results

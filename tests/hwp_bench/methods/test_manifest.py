@@ -12,7 +12,8 @@ import pytest
 from small_methods import write_manifest
 
 from hwp_bench.base.errors import BadMethod, HwpError, UsageError
-from hwp_bench.evaluation.evaluate import EvaluationSettings, with_setting_files
+from hwp_bench.evaluation.capture_evaluation import EvaluationSettings
+from hwp_bench.evaluation.evaluate import with_setting_files
 from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.manifest import (
     MethodManifest,

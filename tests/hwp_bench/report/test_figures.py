@@ -79,6 +79,14 @@ def test_a_figure_in_a_page_has_words_a_title_and_the_colours_of_the_page() -> N
     assert len(of_class(root, "band")) == 2
 
 
+def test_two_captures_have_lines_and_no_bands() -> None:
+    made = made_results("mine", lambda c, f, s: 20.0, captures=2)
+    found = analyse_cost(group_runs([made]), "psnr")
+    figure = draw_pareto(found.curves, found.front, "psnr")
+    assert figure.legends[0].get_title().get_text().startswith("No intervals: of fewer than 3")
+    assert of_class(drawn(inline_svg(figure, "t")), "band") == []
+
+
 def test_names_of_two_figures_on_a_page_differ_and_every_reference_is_there() -> None:
     found = analysis("mine")
     figure = draw_pareto(found.curves, found.front, "psnr", {"Mine": 0})
@@ -133,4 +141,6 @@ def test_files_have_a_legend_and_repeat_byte_for_byte(tmp_path: Path) -> None:
     figure = draw_pareto(found.curves, found.front, "psnr")
     legend = [text.get_text() for text in figure.legends[0].get_texts()]
     assert legend == ["Pareto front", "Mine", "Plain"]
+    title = figure.legends[0].get_title()
+    assert title.get_text() == "Shaded bands are 95 % intervals over captures"
     assert write_figure(tmp_path, "again", figure)[1].read_bytes() == first.read_bytes()

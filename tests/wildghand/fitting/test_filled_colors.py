@@ -31,7 +31,7 @@ from wildghand.gaussians.attributes import CHANNELS, SIZES
 from wildghand.gaussians.regularizers import nearest_on_surface, rest_anchors
 from wildghand.gaussians.rig import HandRig, make_rig
 
-PLAIN: dict[str, Any] = {**UNJUDGED, "shadows.enabled": False, "start_colors": False}
+PLAIN: dict[str, Any] = {**UNJUDGED, "start_colors": False}
 # Channels of the colours in the attributes and in the map.
 COLORS = slice(CHANNELS - SIZES["logit_colors"], CHANNELS)
 TrainingMaker = Callable[..., TrainingCapture]

@@ -35,12 +35,11 @@ from wildghand.fitting.session import load_state, save_state
 from wildghand.model.settings import read_settings
 from wildghand.plain.loop import Watchers, run_fit
 
-QUICK: dict[str, Any] = {**UNJUDGED, "shadows.enabled": False}
 SHORT: dict[str, Any] = {**TINY, "schedule.steps": 4, "schedule.batch": 2}
 VARIANTS: dict[str, dict[str, Any]] = {
     "default": {},
     # What precedes the first step is the same in all processes, and compared in the default.
-    "unjudged": QUICK,
+    "unjudged": UNJUDGED,
     # Three frames in ten keep no biases: processes must draw the same chances.
     "paper": {"mode": "paper", "schedule.epochs": 0},
 }
@@ -84,7 +83,7 @@ class NanLoss(Component):
 
 def check_spoiled(request: Path, world: World) -> None:
     """A loss that is NaN in one process only stops the step in all of them."""
-    settings = read_settings({**SHORT, **QUICK})
+    settings = read_settings({**SHORT, **UNJUDGED})
     fit = make_fit(open_request(request), settings, 0, CPU, world)
     before = fit.model.snapshot()
     if world.rank == 1:
@@ -214,7 +213,7 @@ def test_torchrun_makes_one_avatar_and_one_message(
     capture, avatar = make_painted().root, tmp_path / "avatar"
     options = [
         word
-        for name, value in (SHORT | QUICK).items()
+        for name, value in (SHORT | UNJUDGED).items()
         for word in ("--set", f"{name}={json.dumps(value)}")
     ]
     command = ["fit", str(capture), "-o", str(avatar), "--steps", "2", *options]

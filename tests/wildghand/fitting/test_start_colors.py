@@ -22,12 +22,7 @@ from wildghand.light import CastLight, ShadowTable
 from wildghand.model.settings import read_settings
 from wildghand.visibility.count import read_images, seen_anchors
 
-PLAIN: dict[str, Any] = {
-    **UNJUDGED,
-    "gaussians": 600,
-    "start_colors": False,
-    "shadows.enabled": False,
-}
+PLAIN: dict[str, Any] = {**UNJUDGED, "gaussians": 600, "start_colors": False}
 TrainingMaker = Callable[..., TrainingCapture]
 
 

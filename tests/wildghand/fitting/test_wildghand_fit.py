@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from tiny_fits import QUICK
 
 from hwp_bench.base.errors import BadInput, DidNotConverge, UsageError
 from hwp_bench.base.images import read_rgb
+from hwp_bench.base.records import flattened
 from hwp_bench.capture import Capture
 from hwp_bench.methods import find_method, read_manifest
 from hwp_bench.methods.contract import Budget, TrainingCapture
@@ -327,3 +328,15 @@ def test_settings_of_presets_and_switches() -> None:
     assert not read_settings(base).dpd.enabled
     assert not read_settings(base).pao.enabled
     assert FRAMES > 0
+
+
+def test_bases_of_ablations_name_the_components_that_their_modes_have() -> None:
+    manifest = read_manifest(find_method("wildghand"))
+    for base in manifest.bases.values():
+        values = dict(flattened(asdict(read_settings(base.settings))))
+        # The other hand's colours are found by what frames have shown.
+        values["visibility.other_hand"] &= values["visibility.enabled"]
+        for switch in manifest.switches.values():
+            if not switch.alternative:
+                out = all(values[name] == value for name, value in switch.settings.items())
+                assert out != (switch.name in (*base.crossed, *base.kept)), (base.name, switch.name)

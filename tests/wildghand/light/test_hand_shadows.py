@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from wildghand.light.hand_shadows import LIFT
 from wildghand.model.settings import read_settings
 
 TrainingMaker = Callable[..., TrainingCapture]
+SHADED: dict[str, Any] = {**UNJUDGED, "shadows.enabled": True}
 
 
 def a_light() -> CastLight:
@@ -140,7 +142,7 @@ def test_shading_is_the_irradiance_with_nothing_in_the_way(rigs: dict[str, HandR
 
 
 def test_the_table_of_a_clip_holds_the_same(make_training: TrainingMaker) -> None:
-    fit = make_fit(make_training(), read_settings(UNJUDGED), 0, torch.device("cpu"))
+    fit = make_fit(make_training(), read_settings(SHADED), 0, torch.device("cpu"))
     shadows = HandShadows(fit.model.rigs, a_light())
     table = ShadowTable(shadows, fit.clip)
     pose, betas, transl = fit.clip.parameters["right"]
@@ -154,7 +156,7 @@ def test_shadows_darken_what_is_drawn_and_are_kept(
     make_training: TrainingMaker, tmp_path: Path
 ) -> None:
     training = make_training()
-    fit = make_fit(training, read_settings(UNJUDGED), 0, torch.device("cpu"))
+    fit = make_fit(training, read_settings(SHADED), 0, torch.device("cpu"))
     frame = int(training.validation[0])
     hands, camera = training.hand_poses(frame), training.camera(frame)
     fit.model.shadows = None
@@ -177,7 +179,7 @@ def test_shadows_darken_what_is_drawn_and_are_kept(
 
 
 def test_training_frames_are_drawn_with_their_shadows(make_training: TrainingMaker) -> None:
-    fit = make_fit(make_training(), read_settings(UNJUDGED), 0, torch.device("cpu"))
+    fit = make_fit(make_training(), read_settings(SHADED), 0, torch.device("cpu"))
     fit.model.keep(a_light())
     rows = torch.tensor([1, 4])
     table = ShadowTable(HandShadows(fit.model.rigs, a_light()), fit.clip)
@@ -191,13 +193,12 @@ def test_training_frames_are_drawn_with_their_shadows(make_training: TrainingMak
 
 
 def test_a_fit_finds_a_light_unless_it_is_switched_off(make_training: TrainingMaker) -> None:
-    found = make_fit(make_training(), read_settings(UNJUDGED), 0, torch.device("cpu"))
+    found = make_fit(make_training(), read_settings(SHADED), 0, torch.device("cpu"))
     assert found.model.shadows is not None
     shadows = found.part(Lighting)
     assert shadows is not None
     assert set(shadows.dark(torch.tensor([0]))) == {"right"}
-    off = read_settings({**UNJUDGED, "shadows.enabled": False})
-    without = make_fit(make_training(), off, 0, torch.device("cpu"))
+    without = make_fit(make_training(), read_settings(UNJUDGED), 0, torch.device("cpu"))
     assert without.model.shadows is None
     assert not without.part(Lighting).dark(torch.tensor([0]))
     assert not [name for name, _ in without.model.named_buffers() if name.startswith("shadows_")]

@@ -10,6 +10,7 @@ from hypothesis.extra.numpy import arrays
 
 from hwp_bench.base.colors import linear_to_srgb
 from wildghand.prepass.assessment import PrepassSettings, densest, excess, normal_value
+from wildghand.prepass.intensity import IntensitySamples, fit_intensity, shading_basis
 from wildghand.prepass.judge import LEAST_FRAMES, clean_probability, clip_tolerance, evidence
 from wildghand.prepass.measurements import border_width, misplacement
 
@@ -103,3 +104,32 @@ def test_most_frames_that_are_known_to_be_clean_are_judged_so(found: np.ndarray)
     assert 2 * (clean_probability(found, tolerance) >= 0.5).sum() >= len(found)
     # It is no larger than it must be: as many are at it or above.
     assert tolerance == least or 2 * (found >= tolerance).sum() >= len(found)
+
+
+@pytest.mark.parametrize("lit", [False, True])
+def test_a_pale_palm_is_not_another_light(lit: bool) -> None:
+    # Oracle: the gains that the samples were made with. Backs in 18 frames, palms in 6; the sides
+    # of fingers, a tenth of both, tell which of two causes made the palms 2.5 times as bright.
+    random = np.random.default_rng(11)
+    normals = random.normal(size=(440, 3))
+    normals[:, 2] = np.abs(normals[:, 2]) + 0.2
+    normals[200:400, 2] *= -1.0
+    normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
+    albedo = np.log([0.3, 0.17, 0.1]) + random.normal(0.0, 0.05, (440, 1))
+    gains = np.zeros((24, 3))
+    palms = np.arange(24) >= 18
+    if lit:
+        gains[palms] = 0.9
+    else:
+        albedo[200:400] += 0.9
+    views = [[*(range(200, 400) if palm else range(200)), *range(400, 424)] for palm in palms]
+    cells = np.array(views)
+    light = albedo[cells] + gains[:, None] + random.normal(0.0, 0.02, (*cells.shape, 3))
+    samples = IntensitySamples(
+        np.arange(25) * cells.shape[1],
+        cells.ravel(),
+        light.reshape(-1, 3).astype(np.float32),
+        shading_basis(normals[cells.ravel()]),
+    )
+    model = fit_intensity(samples, normals)
+    np.testing.assert_allclose(model.gains, gains, atol=0.25)

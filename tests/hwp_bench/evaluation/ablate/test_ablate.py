@@ -46,7 +46,9 @@ def test_the_factorial_end_to_end(captures, tmp_path: Path, capsys) -> None:
     assert main(words(method, captures, out, "--seeds", "2")) == 0
     shown = capsys.readouterr()
     assert "Cost of the components" in shown.out
-    assert "Where the seconds go" in shown.out
+    assert "Gains" in shown.out
+    assert "Base row: the method without Tone, Edge; keeps no other" in shown.out
+    assert "Where the seconds go" in (out / "tables" / "seconds.md").read_text()
     assert "[1/16] single, no-tone+no-edge, seed 0 (" in shown.err
     assert "[5/16] pair, no-tone, seed 0" in shown.err
     record = json.loads((out / "ablation.json").read_text())

@@ -93,6 +93,30 @@ def test_what_cannot_be_ablated_is_refused(manifest, tmp_path: Path) -> None:
         make_design(read_manifest(tmp_path))
 
 
+def test_a_base_has_its_own_components(tmp_path: Path) -> None:
+    table = """
+[bases.bare]
+settings = {mode = "bare"}
+crossed = ["b"]
+kept = ["c"]
+"""
+    (tmp_path / "method.toml").write_text(MANIFEST + table)
+    manifest = read_manifest(tmp_path)
+    design = make_design(manifest, base="bare")
+    assert names(design) == ["no-b", "full"]
+    assert [item.name for item in design.kept] == ["c"]
+    assert [item.name for item in make_design(manifest).kept] == ["c"]
+    assert [item.name for item in make_design(manifest, ["c", "alt"], base="bare").kept] == ["b"]
+    with pytest.raises(UsageError, match=r"'a' is out of every variant.*In 'bare' are: b, c"):
+        make_design(manifest, ["a"], base="bare")
+    with pytest.raises(UsageError, match=r"has no base 'other'.*It declares: bare"):
+        make_design(manifest, base="other")
+    for old, new in (('["b"]', '["alt"]'), ('["c"]', '["b"]')):
+        (tmp_path / "method.toml").write_text(MANIFEST + table.replace(old, new))
+        with pytest.raises(BadMethod, match=r"bases\.bare.*(not a component|there twice)"):
+            read_manifest(tmp_path)
+
+
 def test_the_remaining_time_ignores_what_was_found_finished() -> None:
     assert remaining([], 3) is None
     assert remaining([0.01, 0.02, 10.0, 12.0], 4) == pytest.approx(44)

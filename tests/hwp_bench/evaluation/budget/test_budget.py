@@ -19,7 +19,7 @@ from hwp_bench.cli.main import main
 from hwp_bench.evaluation.budget import budget
 from hwp_bench.evaluation.budget.budget import plan_variants, run_budget
 from hwp_bench.evaluation.budget.corrections import CORRECTIONS
-from hwp_bench.evaluation.evaluate import EvaluationSettings
+from hwp_bench.evaluation.capture_evaluation import EvaluationSettings
 from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.request import ORACLE_INPUTS
 

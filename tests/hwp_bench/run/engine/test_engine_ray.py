@@ -19,7 +19,7 @@ from same_results import contents
 from small_captures import CaptureMaker
 
 from hwp_bench.evaluation.ablate.runs import make_design, run_ablation
-from hwp_bench.evaluation.evaluate import EvaluationSettings
+from hwp_bench.evaluation.capture_evaluation import EvaluationSettings
 from hwp_bench.methods.manifest import read_manifest
 from hwp_bench.run.engine import LocalEngine, Needs
 

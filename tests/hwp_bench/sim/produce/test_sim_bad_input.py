@@ -106,8 +106,11 @@ def test_a_killed_render_leaves_no_capture_and_goes_on(tmp_path: Path) -> None:
     psutil.wait_procs(workers)
     assert 2 <= _finished(tmp_path) < FRAMES
     assert main([*command, "--workers", "1"]) == 0
+    peace = tmp_path / "peace"
+    assert main(["sim", "render", str(path), "-o", str(peace), *command[5:], "--workers", "1"]) == 0
     assert len(open_capture(out)) == FRAMES
-    assert {entry.name for entry in tmp_path.iterdir()} == {"tiny.toml", "capture"}
+    assert open_capture(out).digest == open_capture(peace).digest
+    assert {entry.name for entry in tmp_path.iterdir()} == {"tiny.toml", "capture", "peace"}
 
 
 @pytest.mark.slow

@@ -23,8 +23,13 @@ from hwp_bench.leaderboard.entries import (
     write_check,
     write_entry,
 )
-from hwp_bench.leaderboard.rules import check_names, off_the_data, register
-from hwp_bench.leaderboard.soundness import check_dates, sound_entries
+from hwp_bench.leaderboard.rules import (
+    check_dates,
+    check_names,
+    off_the_data,
+    register,
+    sound_entries,
+)
 from hwp_bench.leaderboard.submit import add_entry
 from hwp_bench.leaderboard.suite_data import (
     CaptureData,
@@ -271,7 +276,7 @@ def _renewed(monkeypatch: pytest.MonkeyPatch, *, rendered: bool) -> SuiteData:
         current = Version(letter * 64) if rendered else None
         renewed[name] = CaptureData(current, data.versions)
     data = SuiteData({"smoke": renewed})
-    for module in ("suite_data", "soundness"):
+    for module in ("suite_data", "rules"):
         monkeypatch.setattr(f"hwp_bench.leaderboard.{module}.known_data", lambda: data)
     return data
 
