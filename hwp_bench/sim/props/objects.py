@@ -412,6 +412,7 @@ def _apple(variant: int) -> Surface:
     # A dent at either end.
     dent = 0.06 * np.maximum(np.abs(np.sin(angle)) - 0.9, 0.0) * np.sign(np.sin(angle))
     profile = np.stack([0.0375 * np.cos(angle) ** 0.8, 0.035 * np.sin(angle) - dent], axis=1)
+    profile[[0, -1], 0] = 0.0
     stalk = np.stack([np.zeros(7), 0.002 * np.linspace(0, 1, 7) ** 2, np.linspace(0.025, 0.042, 7)])
     brown = coat((0.25, 0.16, 0.08), gloss=0.7)
     skin = turned(profile, picture_material(image, 0.25), 40)
