@@ -17,6 +17,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib import metadata
+from typing import Any, TypeAlias
 
 from hwp_bench.base.errors import HwpError, MissingDependency, UsageError, did_you_mean
 
@@ -42,6 +43,9 @@ class Measured:
     text: str
 
 
+_Run: TypeAlias = Callable[..., Measured]
+
+
 @dataclass(frozen=True)
 class Case:
     """One hard case."""
@@ -56,6 +60,41 @@ class Case:
     run: Callable[[Context], Measured]
     #: Implementations that this machine has; one empty name where there is no choice.
     backends: tuple[str, ...] = ("",)
+
+
+class CaseGroup:
+    """The hard cases of one part of the product, which functions join by a decorator.
+
+    Args:
+        name: of the group.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._cases: list[Case] = []
+
+    def case(self, name: str, must_hold: str, *values: Any) -> Callable[[_Run], _Run]:
+        """Decorator: a case, or one for each value, which stands in its words and is its argument.
+
+        The decorated function takes the value, or the members of a tuple, and returns `Measured`.
+        """
+
+        def add(run: _Run) -> _Run:
+            for value in values or ((),):
+                given = value if isinstance(value, tuple) else (value,)
+                words = name.format(*given), must_hold.format(*given)
+                self._cases.append(Case(words[0], self._name, words[1], _with(run, given)))
+            return run
+
+        return add
+
+    def __call__(self) -> list[Case]:
+        """Return every case, in the order in which they joined."""
+        return list(self._cases)
+
+
+def _with(run: _Run, given: tuple[Any, ...]) -> Callable[[Context], Measured]:
+    return lambda context: run(*given)
 
 
 @dataclass(frozen=True)

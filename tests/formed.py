@@ -10,7 +10,7 @@ from painted import FRAMES, SIZE, cameras, painted_info
 
 from hwp_bench.base.images import as_uint8
 from hwp_bench.capture import Capture, CaptureWriter
-from hwp_bench.capture.reader import open_capture
+from hwp_bench.capture.folder import open_capture
 from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.methods.contract import Avatar, Budget, HandPose, RunSettings, TrainingCapture

@@ -1,8 +1,9 @@
-"""Methods that are one script, which tries what it must not."""
+"""What tries what it must not: methods that are one script, and a pickle."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from small_methods import SCRIPT, write_manifest
 
@@ -19,3 +20,13 @@ def hostile_method(folder: Path, script: str) -> Path:
     (folder / "run.py").write_text("import json, os, pathlib, subprocess, sys, time\n" + script)
     write_manifest(folder, "hostile", SCRIPT)
     return folder
+
+
+class Exploit:
+    """Pickled, it asks for a call that leaves a file behind."""
+
+    def __init__(self, marker: Path) -> None:
+        self.marker = marker
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Path.touch, (self.marker,)

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import torch
 
+from hwp_bench.capture import Capture
 from hwp_bench.hands import HandTemplate, pose_hand
 from hwp_bench.hands.raster import draw_silhouette
 
@@ -134,3 +135,24 @@ def write_pickles(folder: Path, rows: list[dict[str, Any]], pickles: int = 1) ->
         name = "output.pkl" if part == 0 else f"output_{part}.pkl"
         share = rows if pickles == 1 else rows[part::pickles]
         (folder / name).write_bytes(pickle.dumps(share))
+
+
+def write_rendered(
+    experiment: Path, capture: Capture, frames: list[int], size: int | None = None
+) -> Path:
+    """What the authors' code leaves of a test run, drawn at half the truth; returns `render`."""
+    place = experiment / "images_all" / "-1" / "render"
+    place.mkdir(parents=True)
+    for frame in frames:
+        truth = capture.frame(frame)[:, :, ::-1]
+        drawn = np.where(capture.mask(frame)[..., None] > 127, truth // 2, 0).astype(np.uint8)
+        if size is not None:
+            drawn = cv2.resize(drawn, (size, size))
+        stem = f"frame{frame}_view{frame}"
+        cv2.imwrite(str(place / f"{stem}_gt.png"), truth)
+        cv2.imwrite(str(place / f"{stem}_pred_31.25_lr1.png"), drawn)
+        cv2.imwrite(str(place / f"{stem}_pred_31.25_lr1_bbox.png"), 0 * drawn)
+    cut = place.parent / "pred"
+    cut.mkdir()
+    cv2.imwrite(str(cut / "frame0_view0.png"), np.zeros((9, 7, 3), np.uint8))
+    return place

@@ -11,7 +11,7 @@ import torch
 
 from hwp_bench.base.images import as_uint8
 from hwp_bench.capture import Cameras, Capture, CaptureInfo, CaptureWriter, HandModelId
-from hwp_bench.capture.reader import open_capture
+from hwp_bench.capture.folder import open_capture
 from hwp_bench.hands import load_template
 from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.methods.contract import Avatar, Camera, HandPose, TrainingCapture

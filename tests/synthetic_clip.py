@@ -8,12 +8,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
 
-from hwp_bench.hands import HandParameters, HandTemplate, load_template, pose_hand
+from hwp_bench.hands import HandParameters, HandTemplate, load_template
 from hwp_bench.hands.articulation import joint_axes
 from hwp_bench.hands.raster import draw_silhouette
-from hwp_bench.hands.template import boundary_vertices
+from hwp_bench.hands.skinning import pose_parameters
+from hwp_bench.hands.template import boundary_vertices, rebuilt
 from hwp_bench.importers.shared.landmarks import Landmarks
 from hwp_bench.importers.video import SolveSettings
 
@@ -36,6 +36,21 @@ def landmark_import(steps: int, outline_steps: int) -> SolveSettings:
 @functools.cache
 def template(side: str = "right") -> HandTemplate:
     return load_template(side=side)
+
+
+def with_correctives(hand: HandTemplate) -> HandTemplate:
+    """The same hand, whose vertices move by millimetres with its pose."""
+    basis = np.random.default_rng(0).normal(0, 1e-3, (len(hand.vertices), 3, 135))
+    return rebuilt(hand, pose_basis=basis)
+
+
+def disc(centre: np.ndarray, radius: float, corners: int = 120) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (centre first) and faces of a disc."""
+    angle = np.arange(corners) * 2 * np.pi / corners
+    rim = centre + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    index = np.arange(corners)
+    faces = np.stack([0 * index, 1 + index, 1 + (index + 1) % corners], axis=1)
+    return np.concatenate([centre[None], rim]), faces
 
 
 @dataclass(frozen=True)
@@ -95,12 +110,7 @@ def make_clip(
     transl = np.stack([0.03 * np.sin(time), 0.05 + 0.02 * np.cos(time), 0.42 + 0.0 * time], axis=1)
     transl = transl if shift is None else transl + shift
     hand = HandParameters(pose, np.full(10, 0.3), transl, np.ones(frames, dtype=bool))
-    posed = pose_hand(
-        model.to_torch(torch.float64),
-        torch.from_numpy(hand.pose),
-        torch.from_numpy(hand.betas),
-        torch.from_numpy(hand.transl),
-    )
+    posed = pose_parameters(model, hand)
     joints = posed.landmarks.numpy()
     world = joints - joints.mean(axis=1, keepdims=True)
     # A tracker sees the hand as if the camera looked straight at it.

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 from interhand_release import write_interhand
-from official_release import write_release
+from official_release import write_release, write_rendered
 from own_cache import make_own_cache
 from synthetic_mano import write_mirrored_mano
 
@@ -91,6 +91,9 @@ def test_the_page_leads_to_a_scored_table(
             submission(
                 tmp_path / "submission", [tmp_path / "captures" / f"capture{n}" for n in (0, 4)]
             )
+        if "rendered" in words:
+            compat = open_capture(tmp_path / "compat" / "capture0")
+            write_rendered(tmp_path / "EXPERIMENTS" / "c0_single", compat, [9])
         if words[-1:] == ["free/capture0"]:
             folder = next((tmp_path / "WildGHand").rglob("capture0_subsample3_single"))
             words = [str(folder) if word.startswith("WildGHand/") else word for word in words]

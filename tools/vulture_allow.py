@@ -53,7 +53,7 @@ _.request_share_url  # viser's server calls it
 verbose  # viser's server passes it
 _.channelnames  # OpenImageIO reads it
 _.camera_position  # pyvista reads it
-_.perfect  # a fact of a metric, which tests compare the score of the truth with
+_.view_angle  # pyvista reads it
 _.gain_deviation  # the table CUES names it; getattr reads it
 _.residual_deviation  # a measured cue of the pre-pass, for tests and benchmarks
 _.sharpness  # a measured cue of the pre-pass, for tests and benchmarks

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import sha256_json
+from hwp_bench.metrics.score import CaptureScores, Scores, aggregate
 from hwp_bench.results import Results
 from hwp_bench.results.schema import differing_makers, differing_settings
 from hwp_bench.taxonomy import PERTURBATIONS
@@ -189,6 +190,18 @@ def scopes(results: Results) -> dict[str, dict[str, float]]:
         **carriers,
     }
     return {name: weights for name, weights in found.items() if weights}
+
+
+def scope_scores(captures: Iterable[CaptureScores]) -> dict[str, Scores]:
+    """Return the mean scores of each scope that has any: those of `scopes`."""
+    mean = aggregate(captures)
+    found = {
+        MACRO: mean.overall.macro,
+        "single": mean.single.capture_mean if mean.single else {},
+        "interacting": mean.interacting.capture_mean if mean.interacting else {},
+        **mean.overall.perturbations,
+    }
+    return {scope: scores for scope, scores in found.items() if scores}
 
 
 def common_metrics(runs: Sequence[MethodRuns], names: Sequence[str]) -> list[str]:

@@ -68,6 +68,15 @@ def read_rgb(path: str | os.PathLike[str], size: tuple[int, int] | None = None) 
     return np.ascontiguousarray(pixels[:, :, channels])
 
 
+def read_rgba(path: str | os.PathLike[str], size: tuple[int, int] | None = None) -> np.ndarray:
+    """Read a colour image with its alpha, not multiplied: (H, W, 4) uint8; opaque without one."""
+    pixels = _read(Path(path), size)
+    count = pixels.shape[2]
+    colors = pixels[:, :, [0, 0, 0] if count < 3 else [0, 1, 2]]
+    opaque = np.full((*pixels.shape[:2], 1), 255, dtype=np.uint8)
+    return np.concatenate([colors, pixels[:, :, -1:] if count in (2, 4) else opaque], axis=2)
+
+
 def read_gray(path: str | os.PathLike[str], size: tuple[int, int] | None = None) -> np.ndarray:
     """Read a one-channel image (a mask), (H, W) uint8: of a colour image the first channel."""
     return np.ascontiguousarray(_read(Path(path), size)[:, :, 0])

@@ -198,32 +198,31 @@ _HOLDERS = (dict, list, tuple, StandIn)
 
 def _check_expanded(loaded: Any, most: int) -> None:
     """Refuse what numpy would copy into far more memory than the pickle takes."""
-    # Size and depth of each container, from the inside out; None while its parts are looked at,
-    # so that a part without one contains the container that it is in.
+    # Size and depth of each container; None while its parts are looked at.
     known: dict[int, tuple[int, int] | None] = {}
-    stack: list[Any] = [loaded] if isinstance(loaded, _HOLDERS) else []
-    while stack:
-        item = stack[-1]
-        if known.get(id(item)) is not None:
-            stack.pop()
-            continue
-        inner = [part for part in _parts_of(item) if isinstance(part, _HOLDERS)]
-        if id(item) not in known:
-            known[id(item)] = None
-            if any(known.get(id(part), ()) is None for part in inner):
+
+    def measure(item: Any, level: int) -> tuple[int, int]:
+        if id(item) in known:
+            if (found := known[id(item)]) is None:
                 raise ValueError("a container contains itself")
-            stack += [part for part in inner if id(part) not in known]
-            continue
-        facts = [fact for part in inner if (fact := known[id(part)]) is not None]
-        leaves = sum(_leaf(part) for part in _parts_of(item) if not isinstance(part, _HOLDERS))
-        size = 1 + leaves + sum(fact[0] for fact in facts)
-        depth = 1 + max((fact[1] for fact in facts), default=0)
+            return found
+        known[id(item)] = None
+        size, depth = 1, 1
+        for part in _parts_of(item) if level <= MAX_DEPTH else ():
+            if isinstance(part, _HOLDERS):
+                inner = measure(part, level + 1)
+                size, depth = size + inner[0], max(depth, 1 + inner[1])
+            else:
+                size += _leaf(part)
         if size > most:
             raise ValueError(f"it comes to more than {most:,} numbers and characters")
-        if depth > MAX_DEPTH:
+        if max(level, depth) > MAX_DEPTH:
             raise ValueError("it is nested too deeply")
-        known[id(item)] = (size, depth)
-        stack.pop()
+        known[id(item)] = size, depth
+        return size, depth
+
+    if isinstance(loaded, _HOLDERS):
+        measure(loaded, 1)
 
 
 def _parts_of(item: Any) -> Iterator[Any]:

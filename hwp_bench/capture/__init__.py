@@ -1,8 +1,7 @@
 """The capture on disk: writer, checking reader, check, contact sheet."""
 
-from hwp_bench.capture.reader import Capture, identify_hand_model, open_capture
+from hwp_bench.capture.folder import Capture, CaptureWriter, identify_hand_model, open_capture
 from hwp_bench.capture.schema import Cameras, CaptureInfo, HandModelId
-from hwp_bench.capture.writer import CaptureWriter
 
 __all__ = [
     "Cameras",

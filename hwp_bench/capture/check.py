@@ -16,7 +16,7 @@ from hwp_bench.base.arrays import evenly
 from hwp_bench.base.drawing import fitted, labelled, outlined, sheet
 from hwp_bench.base.errors import BadCapture, BadHandModel, HwpError, UsageError, bounded, shown
 from hwp_bench.base.images import is_blank, pixel_digest
-from hwp_bench.capture.reader import Capture, open_capture
+from hwp_bench.capture.folder import Capture, combine, open_capture
 from hwp_bench.capture.schema import (
     HANDS,
     IMAGE_FOLDERS,
@@ -29,7 +29,6 @@ from hwp_bench.capture.schema import (
     image_path,
     numbers_digests,
 )
-from hwp_bench.capture.writer import combine
 from hwp_bench.hands.skeleton import draw_bones
 from hwp_bench.hands.template import HandTemplate
 from hwp_bench.taxonomy import perturbation

@@ -12,8 +12,7 @@ import trimesh
 
 from hwp_bench.base.errors import ShapeMismatch, UsageError
 from hwp_bench.base.files import atomic_write
-from hwp_bench.capture.reader import Capture, identify_hand_model
-from hwp_bench.capture.writer import rewrite_capture
+from hwp_bench.capture.folder import Capture, identify_hand_model, rewrite_capture
 from hwp_bench.hands.anchors import to_trimesh
 from hwp_bench.hands.fitting import FitTargets, fit_hand
 from hwp_bench.hands.skeleton import HandParameters

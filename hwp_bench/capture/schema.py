@@ -278,11 +278,6 @@ def read_cameras(path: str | os.PathLike[str], frame_count: int) -> Cameras:
     return Cameras(Ks, viewmats)
 
 
-def write_cameras(path: str | os.PathLike[str], cameras: Cameras) -> None:
-    """Write `cameras.npz`."""
-    write_npz(path, {"Ks": cameras.Ks, "viewmats": cameras.viewmats})
-
-
 def read_hands(
     path: str | os.PathLike[str], sides: tuple[str, ...], frame_count: int
 ) -> dict[str, HandParameters]:
@@ -299,9 +294,10 @@ def read_hands(
     }
 
 
-def write_hands(path: str | os.PathLike[str], hands: Mapping[str, HandParameters]) -> None:
-    """Write `hands.npz`."""
-    write_npz(path, hand_arrays(hands))
+def write_numbers(root: Path, hands: Mapping[str, HandParameters], cameras: Cameras) -> None:
+    """Write `hands.npz` and `cameras.npz` of a folder."""
+    write_npz(root / HANDS, hand_arrays(hands))
+    write_npz(root / CAMERAS, vars(cameras))
 
 
 def hand_arrays(hands: Mapping[str, HandParameters]) -> dict[str, np.ndarray]:
@@ -327,7 +323,7 @@ def numbers_digests(hands: Mapping[str, HandParameters], cameras: Cameras) -> di
     """Return the digests of a capture's `hands` and `cameras`."""
     return {
         "hands": arrays_digest(hand_arrays(hands)),
-        "cameras": arrays_digest({"Ks": cameras.Ks, "viewmats": cameras.viewmats}),
+        "cameras": arrays_digest(vars(cameras)),
     }
 
 

@@ -39,6 +39,7 @@ _EVALUATE = """examples:
   hwp-bench evaluate my_method --suite mini --set gaussians=20000 --json
   hwp-bench evaluate baselines/plain --suite mini --frames clean     # upper bound
   hwp-bench evaluate submission --sealed publication/sealed
+  hwp-bench evaluate authors --capture compat/capture0     # after `data import rendered`
   hwp-bench evaluate my_method --suite mini --jobs 4                 # four captures at once
   hwp-bench evaluate my_method --suite full --engine ray://10.0.0.1:6379 --job-gpus 1
 

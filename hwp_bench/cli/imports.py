@@ -1,4 +1,4 @@
-"""Commands that make captures of other data: `data import ...` and `data import-video`."""
+"""Commands that take other data in: `data import ...` and `data import-video`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 from hwp_bench.base.console import notice
 from hwp_bench.base.files import check_places
-from hwp_bench.cli.options import add_force, add_json, print_json, print_result
+from hwp_bench.cli.options import (
+    add_force,
+    add_json,
+    add_splits,
+    print_json,
+    print_result,
+    splits_of,
+)
 
 if TYPE_CHECKING:
     from hwp_bench.importers.video import ImportedClip
@@ -254,9 +261,66 @@ def _interhand26m(args: argparse.Namespace) -> int:
     return print_result(args.json, {"out": str(args.out), **facts}, lines)
 
 
+_RENDERED = """examples:
+  hwp-bench data import rendered EXPERIMENTS/c0_single --capture captures/capture0 -o authors
+  hwp-bench data import rendered EXPERIMENTS/c4_multi --capture captures/capture4 -o authors
+  hwp-bench evaluate authors --capture captures/capture0 captures/capture4 -o runs/authors
+
+DIR is what the authors' code wrote with --run_val: the folder of an experiment, or one in it that
+holds frame649_view649_pred_31.2_lr1.png and so on. OUT becomes a method directory of predictions,
+to which further captures are added. The capture is to be imported with --official-compat, so that
+its frames are cropped as theirs. docs/data.md says what is assumed.
+"""
+
+
+def _add_rendered(parser: argparse.ArgumentParser) -> None:
+    parser.description = "Make predictions of frames that the authors' code has drawn."
+    parser.epilog = _RENDERED
+    add = parser.add_argument
+    add("folder", type=Path, metavar="DIR", help="folder of an experiment of theirs")
+    text = "the capture that they were drawn for"
+    add("--capture", type=Path, required=True, metavar="CAPTURE", help=text)
+    add("-o", "--out", type=Path, required=True, metavar="OUT", help="method directory to fill")
+    name = "short name of the method in tables (default: authors-code)"
+    add("--name", default="authors-code", help=name)
+    add_splits(parser)
+    text = "replace the predictions of that capture"
+    add("--force", action="store_true", help=text)
+    add_json(parser, "print the facts as JSON")
+
+
+def _rendered(args: argparse.Namespace) -> int:
+    from dataclasses import asdict
+
+    from hwp_bench.capture import open_capture
+    from hwp_bench.capture.splits import split_for
+    from hwp_bench.commitments.inputs import check_name
+    from hwp_bench.importers.official.rendered import import_rendered
+
+    inputs = {"DIR": args.folder, "--capture": args.capture, "--splits": args.splits}
+    check_places({"--out": args.out}, inputs)
+    check_name(args.name)
+    capture = open_capture(args.capture)
+    split = split_for(capture.info.id, capture.info.frame_count, splits_of(args))
+    more = {"name": args.name, "overwrite": args.force}
+    made = import_rendered(args.folder, capture, split, args.out, **more)
+    for warning in made.warnings():
+        notice(f"warning: {warning}")
+    wanted = len(made.taken) + len(made.missing) + len(made.refused)
+    lines = [
+        f"predictions: {args.out}, {len(made.taken)} of {wanted} test frames of {made.capture}"
+    ]
+    if made.truth_db is not None:
+        lines.append(f"their ground truth: {made.truth_db:.1f} dB from the capture's frames")
+    lines.append(f"score them: hwp-bench evaluate {args.out} --capture {args.capture}")
+    facts = {"out": str(args.out), **asdict(made), "warnings": made.warnings()}
+    return print_result(args.json, facts, lines)
+
+
 #: The arguments and the work of each command, where `main` looks for them.
 COMMANDS = {
     "video": (_add_video, _video),
     "wildghand": (_add_wildghand, _wildghand),
     "interhand26m": (_add_interhand26m, _interhand26m),
+    "rendered": (_add_rendered, _rendered),
 }

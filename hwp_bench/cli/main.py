@@ -16,6 +16,9 @@ def command_tree() -> Command:
         "wildghand": Command("make captures of the official release", f"{here}.imports:wildghand"),
         "interhand26m": Command("make a capture of InterHand2.6M", f"{here}.imports:interhand26m"),
         "video": Command("make a capture of a video", f"{here}.imports:video"),
+        "rendered": Command(
+            "make predictions of what the authors' code has drawn", f"{here}.imports:rendered"
+        ),
     }
     hands = {
         "convert": Command("express hands in another hand model", f"{here}.data:convert"),
@@ -26,7 +29,7 @@ def command_tree() -> Command:
         "show": Command("draw a contact sheet of a capture", f"{here}.data:show"),
         "audit": Command("check that a capture's split is fair", f"{here}.data:audit"),
         "get": Command("download a public data set", f"{here}.data:get"),
-        "import": Command("make captures of other data", commands=imports),
+        "import": Command("make captures or predictions of other data", commands=imports),
         "import-video": Command("make a capture of a video", f"{here}.imports:video"),
         "track": Command("track the hands of a video", f"{here}.data:track"),
         "inputs": Command("write the inputs of a program of your own", f"{here}.data:inputs"),

@@ -58,6 +58,11 @@ def write_inputs(
 def check_place(out: str | os.PathLike[str], name: str) -> None:
     """Refuse what `write_inputs` would refuse, before captures are rendered for it."""
     refuse_existing(out)
+    check_name(name)
+
+
+def check_name(name: str) -> None:
+    """Refuse a `--name` that a method cannot have."""
     if not _NAME.fullmatch(name):
         raise UsageError(
             f"{name[:100]!r} is not a name of letters, digits and . _ -", field="--name"

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -67,6 +69,39 @@ def fit_hand(template: HandTemplate, targets: FitTargets, start: HandParameters)
     return fit.result(start)
 
 
+def minimize(
+    groups: list[dict[str, Any]],
+    energy: Callable[[int], torch.Tensor],
+    steps: int,
+    *,
+    warm_up: int = 1,
+    remedy: str | None = None,
+    tick: Callable[[], None] = lambda: None,
+) -> None:
+    """Lower an energy, which takes the number of its step, by Adam over groups of parameters.
+
+    The rates rise over the steps of `warm_up`, and fall to a fiftieth along a cosine; `tick` is
+    called after each step.
+    """
+    optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99))
+
+    def schedule(step: int) -> float:
+        fall = 0.02 + 0.49 * (1.0 + math.cos(math.pi * step / max(steps, 1)))
+        return min(1.0, (step + 1) / warm_up) * fall
+
+    scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, schedule)
+    for step in range(steps):
+        optimizer.zero_grad(set_to_none=True)
+        value = energy(step)
+        if not math.isfinite(float(value.detach())):
+            said = f"the fit of the hand left the finite numbers in step {step}"
+            raise DidNotConverge(said, remedy=remedy)
+        value.backward()
+        optimizer.step()
+        scheduler.step()
+        tick()
+
+
 class _Fit:
     """Variables and targets of the valid frames."""
 
@@ -91,38 +126,28 @@ class _Fit:
         self.transl = torch.tensor(start.transl[chosen], requires_grad=True)
 
     def run(self, steps: int, *, skin: bool) -> None:
-        """Take `steps` steps; the rate falls to a fiftieth along a cosine."""
-        rate = 0.3 if skin else 1.0
-        optimizer = torch.optim.Adam(
-            [
-                {"params": [self.pose], "lr": 0.03 * rate},
-                {"params": [self.betas], "lr": 0.05 * rate},
-                {"params": [self.transl], "lr": 0.004 * rate},
-            ],
-            betas=(0.9, 0.99),
-        )
-        scheduler = torch.optim.lr_scheduler.LambdaLR(
-            optimizer, lambda step: 0.02 + 0.49 * (1.0 + math.cos(math.pi * step / steps))
-        )
-        matches: tuple[torch.Tensor, ...] | None = None
-        for step in range(steps):
-            optimizer.zero_grad(set_to_none=True)
+        """Take `steps` steps, with the skin or without it."""
+        rates = {"pose": 0.03, "betas": 0.05, "transl": 0.004}
+        factor = 0.3 if skin else 1.0
+        groups = [
+            {"params": [getattr(self, name)], "lr": rate * factor} for name, rate in rates.items()
+        ]
+        matches: tuple[torch.Tensor, ...] = ()
+
+        def energy(step: int) -> torch.Tensor:
+            nonlocal matches
             posed = self._posed(self.whole if skin else self.tips)
-            energy = self._landmark_energy(posed)
+            total = self._landmark_energy(posed)
             if skin:
                 if step % _REFRESH == 0:
                     matches = self._match(posed)
-                assert matches is not None
                 index, normals, near = matches
-                energy = _LANDMARK_WEIGHT * energy
-                energy = energy + 1e6 * _squared(self._gaps(posed, index, normals), near)
-            energy = energy + _LIMITS * joint_limit_penalty(self.pose, self.limits).mean()
-            energy = energy + _SHAPE * (self.betas**2).sum()
-            if not math.isfinite(float(energy.detach())):
-                raise DidNotConverge("the fit of a hand left the finite numbers")
-            energy.backward()
-            optimizer.step()
-            scheduler.step()
+                total = _LANDMARK_WEIGHT * total
+                total = total + 1e6 * _squared(self._gaps(posed, index, normals), near)
+            total = total + _LIMITS * joint_limit_penalty(self.pose, self.limits).mean()
+            return total + _SHAPE * (self.betas**2).sum()
+
+        minimize(groups, energy, steps)
 
     def result(self, start: HandParameters) -> FittedHand:
         """The parameters of all frames, with the errors of the fitted ones."""

@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, TypeAlias
 
 import torch
 from torch import Tensor
@@ -20,7 +18,7 @@ from hwp_bench.hands.articulation import axis_angle_to_matrix
 from hwp_bench.hands.skinning import PosedHand, pose_hand, project
 from hwp_bench.hands.sources import load_template
 from hwp_bench.hands.template import TemplateTensors
-from hwp_bench.stability import Case, Measured
+from hwp_bench.stability import CaseGroup, Measured
 
 #: Largest distance of a vertex from its oracle, m, in float64 and in float32.
 EXACT, ROUNDED = 1e-12, 2e-6
@@ -30,34 +28,13 @@ GRADIENT_TOLERANCE = 1e-4
 _NARROW = (("float16", 8 * 2.0**-11), ("bfloat16", 8 * 2.0**-8))
 _ROTATIONS = "vertices and gradients finite, every joint's motion a rotation"
 
-_Run: TypeAlias = Callable[..., Measured]
 _Arguments = tuple[Tensor, Tensor, Tensor]
-_CASES: list[Case] = []
+
+#: Every hard case of the hand model.
+cases = CaseGroup("hands")
 
 
-def cases() -> list[Case]:
-    """Every hard case of the hand model."""
-    return list(_CASES)
-
-
-def _without_context(run: _Run, given: tuple[Any, ...]) -> Callable[[Any], Any]:
-    return lambda context: run(*given)
-
-
-def _case(name: str, must_hold: str, *values: Any) -> Callable[[_Run], _Run]:
-    """Decorator: a case, or one for each value, which stands in its words and is its argument."""
-
-    def add(run: _Run) -> _Run:
-        for value in values or ((),):
-            given = value if isinstance(value, tuple) else (value,)
-            words = name.format(*given), must_hold.format(*given)
-            _CASES.append(Case(words[0], "hands", words[1], _without_context(run, given)))
-        return run
-
-    return add
-
-
-@_case(
+@cases.case(
     "joints turned by {} x 360 degrees more",
     f"vertices to {EXACT:g} m of those without the turns",
     1,
@@ -74,7 +51,7 @@ def _run_turns(turns: int) -> Measured:
     return Measured(off <= EXACT, f"off by {off:.0e} m")
 
 
-@_case("a wrist turned by exactly 360 degrees", "the mesh of pose 0")
+@cases.case("a wrist turned by exactly 360 degrees", "the mesh of pose 0")
 def _run_whole_turn() -> Measured:
     template, (pose, betas, transl) = _template(), _arguments()
     none = torch.zeros_like(pose)
@@ -86,8 +63,12 @@ def _run_whole_turn() -> Measured:
     return Measured(off <= EXACT, f"off by {off:.0e} m")
 
 
-@_case("pose of {:g} rad", _ROTATIONS, *((size, "float32") for size in (1e6, 1e19, 1e25, 3e38)))
-@_case("pose of {:g} rad in float64", _ROTATIONS, *((size, "float64") for size in (1e154, 1e300)))
+@cases.case(
+    "pose of {:g} rad", _ROTATIONS, *((size, "float32") for size in (1e6, 1e19, 1e25, 3e38))
+)
+@cases.case(
+    "pose of {:g} rad in float64", _ROTATIONS, *((size, "float64") for size in (1e154, 1e300))
+)
 def _run_huge_pose(size: float, name: str) -> Measured:
     dtype = getattr(torch, name)
     pose, betas, transl = (value.to(dtype) for value in _arguments())
@@ -103,7 +84,7 @@ def _run_huge_pose(size: float, name: str) -> Measured:
     return Measured(passed, f"{'' if finite else 'not finite, '}R R^T off by {error:.0e}")
 
 
-@_case(
+@cases.case(
     "every beta at {:+g}",
     f"to {ROUNDED:g} m, gradients to {GRADIENT_TOLERANCE:g} of float64",
     20.0,
@@ -129,7 +110,7 @@ def _run_against_float64(beta: float) -> Measured:
     return Measured(passed, f"off by {off:.0e} m, gradients {gradient:.0e}")
 
 
-@_case("one beta at {:+g}", "vertices at rest move {:g} times as far as with 1", 20.0, -20.0)
+@cases.case("one beta at {:+g}", "vertices at rest move {:g} times as far as with 1", 20.0, -20.0)
 def _run_linear(beta: float) -> Measured:
     template = _template()
     pose, transl = torch.zeros(1, 16, 3).double(), torch.zeros(1, 3).double()
@@ -142,7 +123,7 @@ def _run_linear(beta: float) -> Measured:
     return Measured(worst <= EXACT, f"off by {worst:.0e} m")
 
 
-@_case("transposed, strided and expanded arguments", "the same bits")
+@cases.case("transposed, strided and expanded arguments", "the same bits")
 def _run_strided() -> Measured:
     template, (pose, betas, transl) = _template(), _arguments()
     plain = pose_hand(template, pose, betas.expand(len(pose), -1).contiguous(), transl)
@@ -156,7 +137,7 @@ def _run_strided() -> Measured:
     return Measured(same, f"off by {_distance(plain, strided):g} m")
 
 
-@_case("no frame", "empty arrays of the right shapes, gradients 0")
+@cases.case("no frame", "empty arrays of the right shapes, gradients 0")
 def _run_no_frame() -> Measured:
     pose, betas, transl = (value.clone() for value in _arguments())
     leaves = [pose[:0].requires_grad_(), betas.requires_grad_(), transl[:0].requires_grad_()]
@@ -167,7 +148,7 @@ def _run_no_frame() -> Measured:
     return Measured(passed, f"landmarks {shapes[0]}, motions {shapes[1]}")
 
 
-@_case("one frame of many", f"to {EXACT:g} m of the frame in a batch")
+@cases.case("one frame of many", f"to {EXACT:g} m of the frame in a batch")
 def _run_single() -> Measured:
     template, (pose, betas, transl) = _template(), _arguments()
     many = pose_hand(template, pose, betas, transl).vertices
@@ -179,7 +160,7 @@ def _run_single() -> Measured:
     return Measured(off <= EXACT, f"off by {off:.0e} m")
 
 
-@_case("a template in {}", "to {1:g} of the extent of float64's result", *_NARROW)
+@cases.case("a template in {}", "to {1:g} of the extent of float64's result", *_NARROW)
 def _run_narrow(name: str, share: float) -> Measured:
     dtype = getattr(torch, name)
     given = tuple(value.to(dtype) for value in _arguments())
@@ -195,7 +176,7 @@ def _run_narrow(name: str, share: float) -> Measured:
     return Measured(passed, f"off by {off:.0e} of the extent")
 
 
-@_case(
+@cases.case(
     "{} arguments on a float32 template",
     "one message that names the argument, both types and the remedy",
     *(name for name, _ in _NARROW),
@@ -211,7 +192,7 @@ def _run_mixed(name: str) -> Measured:
     return Measured(False, "no message")
 
 
-@_case(
+@cases.case(
     "a hand behind the camera",
     "depths negative; the pixels of the hand reflected through the camera's centre",
 )
@@ -227,7 +208,7 @@ def _run_behind() -> Measured:
     return Measured(passed, f"off by {off:.0e} px, depth {float(behind.max()):.2g} m")
 
 
-@_case("a hand around the camera's centre", "pixels and gradients finite")
+@cases.case("a hand around the camera's centre", "pixels and gradients finite")
 def _run_around() -> Measured:
     pose, betas, transl = _arguments()
     vertices = pose_hand(_template(), pose, betas, transl).vertices
@@ -241,7 +222,7 @@ def _run_around() -> Measured:
     return Measured(passed, f"largest pixel {float(pixels.detach().abs().max()):.0e}")
 
 
-@_case("left and right hand in one place", f"each other's mirror image to {EXACT:g} m")
+@cases.case("left and right hand in one place", f"each other's mirror image to {EXACT:g} m")
 def _run_pair() -> Measured:
     pose, betas, transl = _arguments()
     flip = torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)

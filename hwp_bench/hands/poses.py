@@ -12,7 +12,7 @@ from types import MappingProxyType
 import numpy as np
 
 from hwp_bench.base.errors import BadInput
-from hwp_bench.hands.skeleton import FINGERS, PARENTS, finger_joints, landmark_order
+from hwp_bench.hands.skeleton import FINGERS, PARENTS, finger_joints, landmark_order, moved_joints
 from hwp_bench.hands.template import HandTemplate
 
 #: First joint of each finger in MANO's order.
@@ -229,14 +229,9 @@ def turned(pose: np.ndarray, turn: np.ndarray) -> np.ndarray:
     return np.where(nearer[..., None], other, vectors)
 
 
-def _moved_by(joint: int) -> list[int]:
+def _moved_by(joint: int) -> np.ndarray:
     """Landmarks that a joint carries."""
-    owners = [*range(16), *(finger_joints(finger)[-1] for finger in FINGERS)]
-    carried = []
-    for number, row in enumerate(landmark_order()):
-        above = owners[row] if row >= 16 else PARENTS[owners[row]]
-        while above >= 0 and above != joint:
-            above = PARENTS[above]
-        if above == joint:
-            carried.append(number)
-    return carried
+    below = moved_joints()[joint] > 0
+    tips = below[[finger_joints(finger)[-1] for finger in FINGERS]]
+    below[joint] = False
+    return np.flatnonzero(np.concatenate([below, tips])[list(landmark_order())])

@@ -6,10 +6,11 @@ hand hides are inside the one mask of a capture. Sleeves and marks on the skin a
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -139,10 +140,6 @@ class ManoAnnotation:
     #: (F,) bool, false where the data set has none.
     valid: np.ndarray
 
-    def select(self, kept: np.ndarray) -> ManoAnnotation:
-        """Those of some frames, (F,) bool."""
-        return ManoAnnotation(*(getattr(self, part.name)[kept] for part in fields(self)))
-
 
 @dataclass(frozen=True, eq=False)
 class InterHandRecords:
@@ -150,8 +147,9 @@ class InterHandRecords:
 
     #: Part of the data set.
     split: str
-    #: (F,) frame numbers, ascending.
+    #: (F,) frame numbers, ascending; and those of frames that are left out, as they are black.
     frames: np.ndarray
+    black: list[int]
     #: F image files.
     images: tuple[Path, ...]
     #: (width, height) px.
@@ -166,16 +164,6 @@ class InterHandRecords:
     joints: Mapping[str, np.ndarray]
     #: MANO parameters by side.
     mano: Mapping[str, ManoAnnotation]
-
-    def select(self, kept: np.ndarray) -> InterHandRecords:
-        """The annotations of some frames, (F,) bool."""
-        return replace(
-            self,
-            frames=self.frames[kept],
-            images=tuple(image for image, one in zip(self.images, kept, strict=True) if one),
-            joints={side: joints[kept] for side, joints in self.joints.items()},
-            mano={side: hand.select(kept) for side, hand in self.mano.items()},
-        )
 
 
 class _Annotations:
@@ -362,13 +350,30 @@ def read_annotations(
     sizes = {(row["width"], row["height"]) for row in rows}
     if len(sizes) != 1:
         raise BadInput(f"has frames of sizes {sorted(sizes)}", where=files.images)
-    frames = np.array([row["frame_idx"] for row in rows])
+    size = sizes.pop()
+    # The data set has some black images (its issue 125).
+    numbers = [row["frame_idx"] for row in rows]
+    shows = [not is_blank(read_rgb(image, size[::-1])) for image in images]
+    black = [number for number, good in zip(numbers, shows, strict=True) if not good]
+    if sum(shows) < FEWEST:
+        raise BadInput(
+            f"{len(black)} of {len(rows)} images of the sequence are black, or of one colour",
+            where=root,
+            remedy="Get the images again, or another camera of the sequence.",
+        )
+    if black:
+        notice(
+            f"warning: {len(black)} of {len(rows)} frames are black, or of one colour, and are "
+            f"left out: {bounded(black)}."
+        )
+    frames = np.array(numbers)[shows]
     keys = [str(frame) for frame in frames]
     return InterHandRecords(
         files.split,
         frames,
-        images,
-        sizes.pop(),
+        black,
+        tuple(itertools.compress(images, shows)),
+        size,
         sides,
         *files.camera(),
         joints=files.joints(keys, sides),
@@ -389,11 +394,10 @@ def import_interhand(
     options = options or InterHandImport()
     refuse_existing(out, overwrite=options.overwrite)
     records = read_annotations(root, sequence, options.side, mano=options.mano is not None)
-    records, black = _without_black_frames(records, root)
     count = len(records.frames)
     facts: dict[str, Any] = {"frames": count, "hands": list(records.sides)}
-    if black:
-        facts["black_frames"] = black
+    if records.black:
+        facts["black_frames"] = records.black
     templates = {side: load_template(options.model, side) for side in records.sides}
     hands: dict[str, HandParameters] = {}
     errors: dict[str, dict[str, Any]] = {}
@@ -435,27 +439,6 @@ def import_interhand(
         licence=LICENCE,
     )
     return facts
-
-
-def _without_black_frames(
-    records: InterHandRecords, root: str | os.PathLike[str]
-) -> tuple[InterHandRecords, list[int]]:
-    """Leave out frames whose image is black, as the data set has some (its issue 125)."""
-    height, width = records.size[::-1]
-    kept = np.array([not is_blank(read_rgb(path, (height, width))) for path in records.images])
-    black = [int(frame) for frame in records.frames[~kept]]
-    if kept.sum() < FEWEST:
-        raise BadInput(
-            f"{len(black)} of {len(kept)} images of the sequence are black, or of one colour",
-            where=root,
-            remedy="Get the images again, or another camera of the sequence.",
-        )
-    if black:
-        notice(
-            f"warning: {len(black)} of {len(kept)} frames are black, or of one colour, and are "
-            f"left out: {bounded(black)}."
-        )
-    return records.select(kept), black
 
 
 def _import_hand(

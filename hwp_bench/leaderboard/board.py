@@ -9,7 +9,7 @@ from typing import Any
 
 from hwp_bench.analysis.columns import Filled, score_column, table_of
 from hwp_bench.analysis.compare import Rank, compare, rank_methods, verdict
-from hwp_bench.analysis.pairing import MACRO, group_runs, same_but_seed
+from hwp_bench.analysis.pairing import MACRO, group_runs, same_but_seed, scope_scores
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.tables import Column, Table
 from hwp_bench.evaluation.sentences import find_missing
@@ -18,7 +18,7 @@ from hwp_bench.leaderboard.rules import HEADLINE, current, source_of, tables_of,
 from hwp_bench.leaderboard.suite_data import Severities, on_current_data, suite_severities
 from hwp_bench.metrics import HWP_V1
 from hwp_bench.metrics import metric as metric_facts
-from hwp_bench.metrics.score import CaptureScores, aggregate
+from hwp_bench.metrics.score import CaptureScores
 from hwp_bench.report.study_tables import METRIC
 from hwp_bench.results import CaptureResult, Results
 from hwp_bench.results.schema import score_rows
@@ -227,23 +227,14 @@ SEVERITIES = (1, 2, 3, 4, 5)
 def _scopes(entry: Entry) -> dict[str, Mapping[str, float]]:
     """Means of the metrics of an entry by scope; an empty one where it has no such capture."""
     captures = score_rows(entry.results)
-    found = _means(captures)
+    found: dict[str, Mapping[str, float]] = {scope: {} for scope in SCOPES}
+    found |= scope_scores(captures)
     severities = suite_severities(entry.results.suite)
     for level in SEVERITIES:
         if chosen := at_severity(captures, severities, level):
-            found |= {f"{scope}@{level}": means for scope, means in _means(chosen).items() if means}
+            own = scope_scores(chosen)
+            found |= {f"{scope}@{level}": means for scope, means in own.items()}
     return found
-
-
-def _means(captures: Sequence[CaptureScores]) -> dict[str, Mapping[str, float]]:
-    mean = aggregate(captures)
-    return {
-        **{scope: {} for scope in SCOPES},
-        "macro": mean.overall.macro,
-        "single": mean.single.capture_mean if mean.single else {},
-        "interacting": mean.interacting.capture_mean if mean.interacting else {},
-        **mean.overall.perturbations,
-    }
 
 
 def severities_of(rows: Sequence[BoardRow]) -> list[int]:

@@ -282,7 +282,7 @@ class TrainingCapture:
         It is that of the hand model; in an error budget with the truth `mesh` it is the subject's
         own, which no shape parameter changes. A template that is not the capture's is refused.
         """
-        from hwp_bench.capture.reader import load_matching_template
+        from hwp_bench.capture.folder import load_matching_template
         from hwp_bench.capture.schema import read_subject_mesh
 
         if side not in self.sides:

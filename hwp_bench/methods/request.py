@@ -27,13 +27,10 @@ from hwp_bench.base.files import atomic_folder, read_json, write_json
 from hwp_bench.base.images import read_gray, read_rgb
 from hwp_bench.base.records import parse_record, without_schema
 from hwp_bench.capture.schema import (
-    CAMERAS,
     FREE_VIEW,
-    HANDS,
     IMAGE_FOLDERS,
     image_path,
-    write_cameras,
-    write_hands,
+    write_numbers,
     write_subject_mesh,
 )
 from hwp_bench.capture.splits import Split
@@ -85,8 +82,7 @@ def write_request(path: Path, capture: Capture, split: Split, run: RunSettings) 
                 target = image_path(root, kind, frame)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(source, target)
-        write_hands(root / HANDS, material.hands)
-        write_cameras(root / CAMERAS, capture.cameras)
+        write_numbers(root, material.hands, capture.cameras)
         mesh = "mesh" in _replaced_by(run.frames)
         if mesh:
             own = {side: capture.true_template(side) for side in info.sides}
@@ -94,8 +90,8 @@ def write_request(path: Path, capture: Capture, split: Split, run: RunSettings) 
         clip = capture.free_view
         if clip is not None:
             (root / FREE_VIEW).mkdir()
-            write_hands(root / FREE_VIEW / HANDS, choose_free_view_hands(clip, run.frames))
-            write_cameras(root / FREE_VIEW / CAMERAS, clip.cameras)
+            hands = choose_free_view_hands(clip, run.frames)
+            write_numbers(root / FREE_VIEW, hands, clip.cameras)
         record = RequestRecord(
             id=info.id,
             hands=info.hands,

@@ -20,7 +20,7 @@ from hwp_bench.base.files import cache_root, inside, read_json, sha256_json
 from hwp_bench.base.records import parse_record
 from hwp_bench.base.tables import Cell, Column, Table
 from hwp_bench.capture import Capture, open_capture
-from hwp_bench.capture.reader import digest_at
+from hwp_bench.capture.folder import digest_at
 from hwp_bench.capture.schema import CaptureInfo, frame_name
 from hwp_bench.results import CaptureResult, Results, results_among
 from hwp_bench.results.schema import MAX_FRAMES

@@ -93,17 +93,20 @@ def overlap(one: Region, other: Region) -> float:
 
     Source: MediaPipe's AssociationNormRectCalculator leaves the rotation out too.
     """
-    across = _shared(one.x, one.width, other.x, other.width)
-    down = _shared(one.y, one.height, other.y, other.height)
-    shared = across * down
-    union = one.width * one.height + other.width * other.height - shared
-    return shared / union if union > 0 else 0.0
+    boxes = []
+    for region in (one, other):
+        centre, half = np.array([region.x, region.y]), np.array([region.width, region.height]) / 2
+        boxes.append((centre - half, centre + half))
+    return _box_overlap(*boxes[0], *boxes[1])
 
 
-def _shared(centre: float, length: float, other: float, other_length: float) -> float:
-    """Length that two intervals share."""
-    end = min(centre + length / 2, other + other_length / 2)
-    return max(end - max(centre - length / 2, other - other_length / 2), 0.0)
+def _box_overlap(
+    low: np.ndarray, high: np.ndarray, other_low: np.ndarray, other_high: np.ndarray
+) -> float:
+    """Intersection over union of two boxes, each from its lower to its upper corner."""
+    shared = np.prod(np.clip(np.minimum(high, other_high) - np.maximum(low, other_low), 0, None))
+    union = np.prod(high - low) + np.prod(other_high - other_low) - shared
+    return float(shared / union) if union > 0 else 0.0
 
 
 def cut_region(image: np.ndarray, region: Region, edge: int, *, outside_black: bool) -> np.ndarray:
@@ -208,18 +211,19 @@ def suppress(palms: list[Palm]) -> list[Palm]:
     found = []
     while rest:
         best = rest[0]
-        same = [palm for palm in rest if palm is best or _box_overlap(palm, best) > _SAME_PALM]
+        same = [
+            palm
+            for palm in rest
+            if palm is best or _box_overlap(palm.low, palm.high, best.low, best.high) > _SAME_PALM
+        ]
         rest = [palm for palm in rest if not any(palm is one for one in same)]
         weights = np.array([palm.score for palm in same])
         weights /= weights.sum()
-        found.append(
-            Palm(
-                np.tensordot(weights, [palm.low for palm in same], 1),
-                np.tensordot(weights, [palm.high for palm in same], 1),
-                np.tensordot(weights, [palm.keypoints for palm in same], 1),
-                best.score,
-            )
+        low, high, keypoints = (
+            np.tensordot(weights, [getattr(palm, part) for palm in same], 1)
+            for part in ("low", "high", "keypoints")
         )
+        found.append(Palm(low, high, keypoints, best.score))
     return found
 
 
@@ -236,15 +240,6 @@ def place_in_image(palm: Palm, width: int, height: int) -> Palm:
         to_image(part, square) for part in (palm.low, palm.high, palm.keypoints)
     )
     return Palm(low, high, keypoints, palm.score)
-
-
-def _box_overlap(one: Palm, other: Palm) -> float:
-    """Intersection over union of two boxes."""
-    shared = np.prod(
-        np.clip(np.minimum(one.high, other.high) - np.maximum(one.low, other.low), 0, None)
-    )
-    union = np.prod(one.high - one.low) + np.prod(other.high - other.low) - shared
-    return float(shared / union) if union > 0 else 0.0
 
 
 # --- Hands

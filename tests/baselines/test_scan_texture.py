@@ -27,7 +27,7 @@ from painted import (
 
 from hwp_bench.base.images import as_uint8
 from hwp_bench.capture import Cameras, Capture, CaptureWriter
-from hwp_bench.capture.reader import open_capture
+from hwp_bench.capture.folder import open_capture
 from hwp_bench.hands.skeleton import HandParameters
 from plain_fit.method import PlainMethod
 from scan_texture_fit.method import (

@@ -22,6 +22,7 @@ def command_tree() -> Command:
             "view": Command("pose an avatar in the browser", f"{show}:view"),
             "export": Command("write an avatar as Gaussians for viewers", f"{show}:export"),
             "page": Command("write an avatar as a page for browsers, one file", f"{show}:page"),
+            "stage": Command("draw an avatar and its cameras in 3D", f"{show}:stage"),
             "judge": Command("judge the frames of a capture: clean or perturbed", f"{study}:judge"),
             "explain": Command(
                 "show what the biases took out of training frames", f"{study}:explain"

@@ -138,10 +138,13 @@ _EXPORT_EXAMPLES = """examples:
   wildghand export my_avatar -o hand.ply --supersplat
   wildghand export my_avatar -o splats.glb
   wildghand export my_avatar -o hand.glb --mesh --poses my_capture
+  wildghand export frame649.pth -o hand.ply      # Gaussians that the authors' code has made
 
 The extension decides the format: .ply, Gaussians in the layout of 3DGS; .spz, the same in a tenth
 of the size; .glb, Gaussians as glTF (KHR_gaussian_splatting, a release candidate), or with --mesh
-a skinned mesh with 16 joints a hand, a texture and a motion. Lengths are metres.
+a skinned mesh with 16 joints a hand, a texture and a motion. Lengths are metres. In place of an
+avatar's folder a file (.pth, .ckpt) may stand with the Gaussians of one pose, as the authors' code
+makes them; docs/export.md says how it is saved.
 """
 
 
@@ -171,7 +174,7 @@ def add_export(parser: argparse.ArgumentParser) -> None:
 
 def do_export(args: argparse.Namespace) -> int:
     """Run the command."""
-    from wildghand.export.formats import ExportSettings, check_target, export
+    from wildghand.export.formats import ExportSettings, check_target, export, export_gaussians
 
     names = (item.name for item in dataclasses.fields(ExportSettings))
     settings = ExportSettings(**{name: getattr(args, name) for name in names})
@@ -180,15 +183,67 @@ def do_export(args: argparse.Namespace) -> int:
     if args.frame is not None and (args.poses is None or args.mesh):
         raise UsageError("needs --poses, and no --mesh", field="--frame")
 
-    from hwp_bench.capture import open_capture
+    counts: dict[str, int]
+    if args.avatar.is_file():
+        if args.poses is not None:
+            raise UsageError("needs an avatar, not Gaussians of one pose", field="--poses")
+        from wildghand.export.official import read_official_gaussians
 
-    capture = None if args.poses is None else open_capture(args.poses)
-    more: dict[str, Any] = {"capture": capture, "frame": args.frame, "overwrite": args.overwrite}
-    counts = export(avatar_of(args), args.out, settings, **more)
+        splats = read_official_gaussians(args.avatar)
+        counts = export_gaussians(splats, args.out, settings, overwrite=args.overwrite)
+    else:
+        from hwp_bench.capture import open_capture
+
+        capture = None if args.poses is None else open_capture(args.poses)
+        more: dict[str, Any] = {"frame": args.frame, "overwrite": args.overwrite}
+        counts = export(avatar_of(args), args.out, settings, capture=capture, **more)
     if args.json:
         print_json({"file": str(args.out), **counts})
     else:
         print(f"{args.out}: " + ", ".join(f"{count} {name}" for name, count in counts.items()))
+    return 0
+
+
+_STAGE_EXAMPLES = """examples:
+  wildghand stage my_avatar --poses my_capture
+  wildghand stage my_avatar --poses my_capture --frame 30 -o side.png
+
+Draws the Gaussians of one frame as ellipsoids and the cameras of the clip in 3D, seen from the
+side: the camera of the frame is red, others are grey. It needs no display.
+"""
+
+
+def add_stage(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.epilog = _STAGE_EXAMPLES
+    add_avatar(parser)
+    add_poses(parser, "capture with the pose and the cameras (default: what a fit of a video left)")
+    add, out = parser.add_argument, Path("stage.png")
+    add("--frame", type=int, default=0, help="its frame (default: 0)")
+    text = "image to write (default: stage.png)"
+    add("-o", "--out", type=Path, default=out, metavar="FILE", help=text)
+    add_ending(parser, "file")
+
+
+def do_stage(args: argparse.Namespace) -> int:
+    """Run the command."""
+    from hwp_bench.capture import open_capture
+    from wildghand.viewer.posed_view import capture_of
+    from wildghand.viewer.stage import draw_stage
+
+    check_places({"--out": args.out}, {"AVATAR": args.avatar, "--poses": args.poses})
+    if args.out.suffix.lower() not in (".png", ".jpg"):
+        raise UsageError("has another ending than .png or .jpg", where=args.out, field="--out")
+    if args.out.exists() and not args.overwrite:
+        raise UsageError("exists", where=args.out, remedy="Give --overwrite to replace it.")
+    poses = args.poses or capture_of(args.avatar)
+    if poses is None:
+        raise UsageError("is missing", field="--poses", remedy="Name the capture that was fitted.")
+    count = draw_stage(avatar_of(args), open_capture(poses), args.frame, args.out)
+    if args.json:
+        print_json({"file": str(args.out), "gaussians": count})
+    else:
+        print(f"{args.out}: {count} Gaussians")
     return 0
 
 
@@ -244,4 +299,5 @@ COMMANDS = {
     "view": (add_view, do_view),
     "export": (add_export, do_export),
     "page": (add_page, do_page),
+    "stage": (add_stage, do_stage),
 }

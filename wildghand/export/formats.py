@@ -12,7 +12,7 @@ from hwp_bench.base.files import atomic_write
 from hwp_bench.base.packages import __version__
 from hwp_bench.capture import Capture
 from hwp_bench.hands import load_template
-from wildghand.avatar.avatar import WildGHandAvatar
+from wildghand.avatar.avatar import PosedGaussians, WildGHandAvatar
 from wildghand.avatar.render import shown_sides
 from wildghand.export.mesh import (
     SIZE,
@@ -27,6 +27,8 @@ from wildghand.export.splats import (
     HALF_TURN,
     MAX_DEGREE,
     SUPERSPLAT_SCALE,
+    SeenGaussians,
+    even_harmonics,
     for_supersplat,
     harmonics,
     laid_to_rest,
@@ -114,6 +116,33 @@ def export(
     return counts
 
 
+def export_gaussians(
+    splats: PosedGaussians,
+    path: Path,
+    settings: ExportSettings | None = None,
+    *,
+    overwrite: bool = False,
+) -> dict[str, int]:
+    """Write Gaussians with one colour each for other programs, where they lie; y is down."""
+    settings = settings or ExportSettings()
+    check_target(path, settings, overwrite=overwrite)
+    for field in ("mesh", "supersplat"):
+        if getattr(settings, field):
+            raise UsageError("needs an avatar, not Gaussians of one pose", field=f"--{field}")
+    suffix = path.suffix.lower()
+    if suffix != ".ply":
+        # Not seen from any side: only the geometry is turned.
+        none = np.zeros((0, len(splats), 3))
+        splats = (
+            SeenGaussians(splats, none, none, none[..., 0]).moved(HALF_TURN, np.zeros(3)).splats
+        )
+    placed = scaled(splats, settings.scale)
+    colors = even_harmonics(splats.colors)
+    data = _file_of(placed, colors, suffix, settings.scale, "y is down, z is front")
+    atomic_write(path, data, overwrite=overwrite, flag="--overwrite")
+    return {"gaussians": len(placed)}
+
+
 def _splat_bytes(
     avatar: WildGHandAvatar,
     suffix: str,
@@ -136,13 +165,18 @@ def _splat_bytes(
     if suffix != ".ply" and down:
         given = given.moved(HALF_TURN, np.zeros(3))
     placed, colors = scaled(given.splats, scale), harmonics(given, settings.harmonics)
-    counts = {"gaussians": len(placed)}
+    return _file_of(placed, colors, suffix, scale, axes), {"gaussians": len(placed)}
+
+
+def _file_of(
+    placed: PosedGaussians, colors: np.ndarray, suffix: str, scale: float, axes: str
+) -> bytes:
+    """The bytes of a file of Gaussians with the harmonics of their colours."""
     if suffix == ".ply":
-        comments = (_GENERATOR, f"{scale:g} units are a metre", axes)
-        return ply_bytes(placed, colors, comments), counts
+        return ply_bytes(placed, colors, (_GENERATOR, f"{scale:g} units are a metre", axes))
     if suffix == ".spz":
-        return spz_bytes(placed, colors), counts
-    return splat_glb_bytes(placed, colors, _GENERATOR), counts
+        return spz_bytes(placed, colors)
+    return splat_glb_bytes(placed, colors, _GENERATOR)
 
 
 def _mesh_bytes(

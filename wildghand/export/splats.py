@@ -171,7 +171,7 @@ def harmonics(given: SeenGaussians, degree: int) -> np.ndarray:
         weights = given.facing.clip(min=0.0) ** 2 + 1e-9
         mean = (weights[..., None] * given.colors).sum(axis=0) / weights.sum(axis=0)[:, None]
         color = share * given.colors[0] + (1.0 - share) * mean
-        return ((color - 0.5) / SH_CONSTANT)[:, None].astype(np.float32)
+        return even_harmonics(color)
     weights = (given.facing - _RIM).clip(min=0.0) ** 2 + 1e-4
     weights[0] *= _FRONT
     ridge = _RIDGE * np.eye(size)
@@ -186,6 +186,11 @@ def harmonics(given: SeenGaussians, degree: int) -> np.ndarray:
         right = np.einsum("vn,vnk,vnc->nkc", shares, basis, wanted, optimize=True)
         found[rows] = np.linalg.solve(matrix, right)
     return found
+
+
+def even_harmonics(colors: np.ndarray) -> np.ndarray:
+    """(N, 1, 3) harmonics of degree 0 of colours (N, 3) that are the same from every side."""
+    return ((colors - 0.5) / SH_CONSTANT)[:, None].astype(np.float32)
 
 
 def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:

@@ -55,6 +55,8 @@ class Descent:
         optimizer: several fits may share it.
         shared: texture features of the steps of a block.
         steps: that were taken.
+        skipped: those of them in which a gradient was not finite, so that nothing moved; on the
+            device.
     """
 
     def __init__(
@@ -70,6 +72,7 @@ class Descent:
         self.steps = 0
         self._schedule, self._epoch = schedule, epoch
         self._device = model.log_gains.device
+        self.skipped = torch.zeros((), device=self._device)
 
     def set_rates(self, fraction: float) -> None:
         """Set the rates of all groups for a step; see `rate_factor`."""
@@ -87,7 +90,7 @@ class Descent:
             for gradient in (tensor.grad for tensor in self.tensors()):
                 if gradient is not None:
                     gradient.nan_to_num_(0.0, 0.0, 0.0)
-        self.optimizer.take_step(waiting)
+        self.skipped = self.skipped + self.optimizer.take_step(waiting)
         self.steps += 1
 
     def tensors(self) -> list[Tensor]:
@@ -100,13 +103,14 @@ class Descent:
             "optimizer": self.optimizer.state_dict(),
             "shared": self.shared.state_dict(),
             "steps": self.steps,
+            "skipped": self.skipped,
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on from a saved state; the model's must be loaded before."""
         self.optimizer.load_state_dict(state["optimizer"])
         self.shared.load_state_dict(state["shared"])
-        self.steps = int(state["steps"])
+        self.steps, self.skipped = int(state["steps"]), state["skipped"]
 
 
 def make_optimizer(

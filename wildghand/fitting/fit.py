@@ -306,6 +306,10 @@ class Fit(IterativeFit[WildGHandAvatar]):
         """See `IterativeFit`."""
         return self.model.finite()
 
+    def skipped(self) -> int:
+        """See `IterativeFit`."""
+        return int(self.descent.skipped)
+
     def snapshot(self) -> dict[str, Tensor]:
         """See `IterativeFit`."""
         return self.model.snapshot()

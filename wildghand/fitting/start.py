@@ -83,6 +83,8 @@ class StartFromPrior(Component):
         if prior is not None:
             prior.initialise(network)
             self._source = {"prior": prior.record.weights}
+        elif fit.settings.network.size == "paper":
+            fit.tell("No prior of the paper's network is there: it starts from random weights.")
 
     def record(self, fit: Fit, *, final: bool) -> dict[str, Any]:
         """The digest of the prior's weights."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -20,7 +20,7 @@ from hwp_bench.base.errors import BadInput, HwpError, reason_of
 from hwp_bench.base.files import canonical_json, check_is_file, sha256_of
 from hwp_bench.base.images import as_uint8, read_gray, write_image, write_movie
 from hwp_bench.capture import Capture, open_capture
-from hwp_bench.importers.shared.landmarks import read_association, read_landmarks
+from hwp_bench.importers.shared.landmarks import read_sides
 from hwp_bench.importers.video import FrameRange, VideoImport, import_video
 from hwp_bench.importers.video.api import IMPORTER_VERSION
 from hwp_bench.importers.video.decode import probe
@@ -99,11 +99,23 @@ def avatar_digest(folder: Path) -> str:
     return sha256_of(folder / MODEL) + sha256_of(folder / DESCRIPTION)
 
 
-class _Picture(Stage):
-    """A stage that shows the avatar; its version rises when the picture comes out otherwise."""
+class Picture(Stage):
+    """A stage that shows the avatar.
 
-    #: Everything that the picture depends on, besides the avatar.
-    look: str
+    `look` is everything that the picture depends on besides the avatar, with a version that rises
+    when it comes out otherwise.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        title: str,
+        look: str,
+        seconds: float,
+        show: Callable[[VideoJob, WildGHandAvatar], object],
+    ) -> None:
+        self.name = self.makes = name
+        self.title, self.look, self.seconds, self.show = title, look, seconds, show
 
     def facts(self, job: VideoJob) -> dict[str, str]:
         return {"avatar": avatar_digest(job.folder), f"look of the {self.name}": self.look}
@@ -111,51 +123,26 @@ class _Picture(Stage):
     def run(self, job: VideoJob) -> None:
         self.show(job, load_avatar(job.folder, hand=job.options.hand_model))
 
-    def show(self, job: VideoJob, avatar: WildGHandAvatar) -> None:
-        """Write the picture."""
-        raise NotImplementedError
-
-
-class DrawTurntable(_Picture):
-    """The avatar from all around, as it stands in its studio."""
-
-    name, title, makes = "turntable", "Drawing the turntable", "turntable"
-    look = str((2, SIZE, FRAMES, FPS, BACKGROUND))
-
-    def show(self, job: VideoJob, avatar: WildGHandAvatar) -> None:
-        table = Turntable(avatar, SIZE)
-        angles = track([360.0 * frame / FRAMES for frame in range(FRAMES)], "drawing the turntable")
-        write_movie(job.turntable, (table.view(angle) for angle in angles), FPS)
-
     def expected(self, job: VideoJob) -> float:
-        return 4.0 + 0.1 * FRAMES
+        return self.seconds
 
 
-class DrawSheet(_Picture):
-    """The contact sheet: frames, the avatar in their poses, its weights, and all of its sides."""
-
-    name, title, makes = "sheet", "Drawing the contact sheet", "sheet"
-    look = str((1, COLUMNS, EDGE))
-
-    def show(self, job: VideoJob, avatar: WildGHandAvatar) -> None:
-        drawn = avatar_sheet(avatar, open_capture(job.capture), job.folder / WEIGHTS)
-        write_image(job.sheet, drawn)
-
-    def expected(self, job: VideoJob) -> float:
-        return 6.0
+def draw_turntable(job: VideoJob, avatar: WildGHandAvatar) -> None:
+    """Draw the avatar from all around, as it stands in its studio."""
+    table = Turntable(avatar, SIZE)
+    angles = track([360.0 * frame / FRAMES for frame in range(FRAMES)], "drawing the turntable")
+    write_movie(job.turntable, (table.view(angle) for angle in angles), FPS)
 
 
-class WritePage(_Picture):
-    """The avatar's page: one file that turns and poses it in a browser."""
+def draw_sheet(job: VideoJob, avatar: WildGHandAvatar) -> None:
+    """Draw the contact sheet: frames, the avatar in their poses, its weights, and all sides."""
+    drawn = avatar_sheet(avatar, open_capture(job.capture), job.folder / WEIGHTS)
+    write_image(job.sheet, drawn)
 
-    name, title, makes = "page", "Writing the page", "page"
-    look = "1"
 
-    def show(self, job: VideoJob, avatar: WildGHandAvatar) -> None:
-        write_page(avatar, job.page, capture=open_capture(job.capture), overwrite=True)
-
-    def expected(self, job: VideoJob) -> float:
-        return 15.0
+def write_avatar_page(job: VideoJob, avatar: WildGHandAvatar) -> None:
+    """Write the avatar's page: one file that turns and poses it in a browser."""
+    write_page(avatar, job.page, capture=open_capture(job.capture), overwrite=True)
 
 
 #: Fewest frames with a hand that an avatar is made of.
@@ -243,15 +230,8 @@ def import_options(job: VideoJob) -> VideoImport:
         overwrite=True,
         fit=job.options.importer,
     )
-    sides: tuple[str | None, ...] = (job.options.side,)
-    if job.options.side not in ("right", "left"):
-        # Where the landmarks do not say, only the import's own fit can tell.
-        tracked = read_association(job.landmarks)
-        sides = (None,) if tracked is None else tracked.sides
-    hands = {
-        side: read_landmarks(job.landmarks, min_score=choices.min_score, side=side)
-        for side in sides
-    }
+    # Where the landmarks do not say the side, only the import's own fit can tell.
+    hands = read_sides(job.landmarks, choices.side, min_score=choices.min_score)
     total = len(next(iter(hands.values())).score)
     step = stride(total, job.options.most_frames)
     seen = {side: int(np.count_nonzero(hand.detected[::step])) for side, hand in hands.items()}
@@ -339,13 +319,19 @@ class Place(Stage):
         return 0.1
 
 
-#: The stages of a job, in order. Another one is another class here.
+#: The stages of a job, in order. Another one is another line here.
 STAGES: tuple[Stage, ...] = (
     TrackStage(),
     Import(),
     FitStage(),
     Place(),
-    DrawTurntable(),
-    DrawSheet(),
-    WritePage(),
+    Picture(
+        "turntable",
+        "Drawing the turntable",
+        str((2, SIZE, FRAMES, FPS, BACKGROUND)),
+        4.0 + 0.1 * FRAMES,
+        draw_turntable,
+    ),
+    Picture("sheet", "Drawing the contact sheet", str((1, COLUMNS, EDGE)), 6.0, draw_sheet),
+    Picture("page", "Writing the page", "1", 15.0, write_avatar_page),
 )

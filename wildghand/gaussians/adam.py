@@ -9,6 +9,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+#: A gradient beyond this counts as not finite: float32 cannot hold its square, and a second moment
+#: that is infinite once would hold a parameter where it is for good.
+LARGEST = 1e18
+
 
 class ClippedAdam(torch.optim.Adam):
     """`torch.optim.Adam`, which clips the norm of the gradient; saved states are the same.
@@ -48,6 +52,8 @@ class ClippedAdam(torch.optim.Adam):
     def take_step(self, loss: Tensor) -> Tensor:
         """Move everything that has a gradient; nothing changes where one or the loss is not finite.
 
+        A gradient beyond `LARGEST` counts as not finite.
+
         Nobody waits to learn whether it is: torch's fused kernels read that where it lies, as for a
         `GradScaler`, and skip the step.
 
@@ -62,7 +68,9 @@ class ClippedAdam(torch.optim.Adam):
                     gradients.append(parameter.grad)
         finite = loss.detach().isfinite()
         if gradients:
-            finite = finite & torch.stack(torch._foreach_norm(gradients, math.inf)).isfinite().all()
+            finite = (
+                finite & (torch.stack(torch._foreach_norm(gradients, math.inf)) <= LARGEST).all()
+            )
         stopped = (~finite).float()
         if self.limit > 0.0:
             clipped = [group["params"] for group in self.param_groups if group.get("clipped", True)]

@@ -43,8 +43,8 @@ _UNIT, _LARGEST = 1.001, 1e6
 
 # Turns of albedo, strengths and robust weights.
 _ROUNDS = 6
-# Irradiance and albedo below these are as dark; in the dark nothing casts a shadow.
-_NO_LIGHT = 1e-3
+#: Irradiance and albedo below these are as dark; in the dark nothing casts a shadow.
+NO_LIGHT = 1e-3
 # Residuals count a half at this many medians; the misfit counts them from this residual on.
 _MEDIANS, _MISFIT = 3.0, 0.25
 
@@ -106,8 +106,8 @@ class CastLight(Found):
             (M,) up to 1.
         """
         falling = np.maximum(normals @ self.directions.T, 0.0) * self.strengths
-        without = self.ambient + falling.sum(axis=1) + _NO_LIGHT
-        share = (self.ambient + (falling * free).sum(axis=1) + _NO_LIGHT) / without
+        without = self.ambient + falling.sum(axis=1) + NO_LIGHT
+        share = (self.ambient + (falling * free).sum(axis=1) + NO_LIGHT) / without
         return np.clip(share, darkest, 1.0) ** SRGB
 
     def lit(self) -> CastLight:
@@ -136,7 +136,7 @@ class KnownLight(Found):
     def irradiance(self, normals: Tensor) -> Tensor:
         """E(n) of unit normals (..., 3), positive: (...)."""
         facing = (normals @ self.directions.mT).clamp(min=0.0)
-        return (self.ambient + facing @ self.strengths).clamp(min=_NO_LIGHT)
+        return (self.ambient + facing @ self.strengths).clamp(min=NO_LIGHT)
 
     def nearest_known(self, normals: Tensor) -> Tensor:
         """The nearest normals in the cap: (..., 3); those within it stay."""
@@ -254,7 +254,7 @@ def fit_light(samples: LightSamples, *, ridge: float = 0.03) -> KnownLight | Non
         seen = basis @ strengths
         squares = np.bincount(places, weights * seen**2)
         albedo = np.bincount(places, weights * light * seen) / np.maximum(squares, 1e-9)
-        dark = np.maximum(albedo, _NO_LIGHT)[places]
+        dark = np.maximum(albedo, NO_LIGHT)[places]
         strengths = _solve_strengths(basis * scale[:, None], scale * light / dark, damped)
         strengths = strengths / max(float(np.average(basis @ strengths, weights=weights)), 1e-6)
     axis = weights @ samples.normals
@@ -299,10 +299,10 @@ class _Pursuit:
     def solve(self, basis: np.ndarray) -> _Solved:
         """Solve albedo and strengths by turns; the basis is (M, C) irradiance of each part."""
         samples, light = self._samples, self._samples.light
-        strengths = 1.0 / (basis.shape[1] * np.maximum(basis.mean(axis=0), _NO_LIGHT))
+        strengths = 1.0 / (basis.shape[1] * np.maximum(basis.mean(axis=0), NO_LIGHT))
         robust = np.ones(len(light))
         for _ in range(_ROUNDS):
-            irradiance = np.maximum(basis @ strengths, _NO_LIGHT)
+            irradiance = np.maximum(basis @ strengths, NO_LIGHT)
             ratio = self._ratio(irradiance, samples.weights * robust)
             off = np.abs(ratio - 1.0)
             robust = 1.0 / (1.0 + (off / (_MEDIANS * np.median(off) + 1e-6)) ** 2)
@@ -316,7 +316,7 @@ class _Pursuit:
             )
             mean = np.average(basis @ strengths, weights=samples.weights)
             strengths = strengths / max(float(mean), 1e-6)
-        irradiance = np.maximum(basis @ strengths, _NO_LIGHT)
+        irradiance = np.maximum(basis @ strengths, NO_LIGHT)
         off = self._ratio(irradiance, weights) - 1.0
         misfit = np.average(1.0 - 1.0 / (1.0 + (off / _MISFIT) ** 2), weights=samples.weights)
         return _Solved(strengths, irradiance, off, weights, float(misfit))
@@ -366,7 +366,7 @@ class _Pursuit:
     def _ratio(self, irradiance: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """(M,) light over albedo times irradiance; the albedo is the mean at each place."""
         albedo = self._means((self._samples.light / irradiance)[:, None], weights)[:, 0]
-        return self._samples.light / (np.maximum(albedo, _NO_LIGHT)[self._place] * irradiance)
+        return self._samples.light / (np.maximum(albedo, NO_LIGHT)[self._place] * irradiance)
 
 
 def _solve_strengths(

@@ -68,6 +68,13 @@ class IterativeFit(Generic[Result]):
         """Whether every fitted number is finite."""
         raise NotImplementedError
 
+    def skipped(self) -> int:
+        """Steps so far that moved nothing, because a gradient was not finite.
+
+        A few may happen; a window of nothing else means divergence.
+        """
+        return 0
+
     def snapshot(self) -> dict[str, torch.Tensor]:
         """Copies of everything fitted, which the fit no longer changes."""
         raise NotImplementedError
@@ -135,20 +142,23 @@ class Watchers:
         self._plateau_steps = plateau_steps
         self._best: Any = None
         self._best_loss = self._before = math.inf
+        self._skipped = 0
         self._losses: list[Loss] = []
         self._plateau_losses: list[Loss] = []
 
     def watch(self, step: int, loss: Loss, model: Any) -> bool:
         """Take note of the loss after `step` steps; False means divergence.
 
-        The `model` says whether it is `finite`, and gives a `snapshot` of its state.
+        The `model` says whether it is `finite` and how many steps it has `skipped`, and gives a
+        `snapshot` of its state.
         """
         if not isinstance(loss, torch.Tensor) and not math.isfinite(loss):
             return False
         mean = _mean_of_window(self._losses, loss, WINDOW)
         if mean is None:
             return True
-        if not math.isfinite(mean) or not model.finite():
+        before, self._skipped = self._skipped, model.skipped()
+        if not math.isfinite(mean) or self._skipped - before == WINDOW or not model.finite():
             return False
         if mean < self._best_loss:
             self._best_loss, self._best, self.step = mean, model.snapshot(), step
@@ -163,8 +173,10 @@ class Watchers:
         return mean > (1.0 - PROGRESS) * before
 
     def sound(self, model: Any) -> bool:
-        """Whether the model and the losses since the last window are finite, when a fit ends."""
-        return all(map(math.isfinite, _read_losses(self._losses))) and model.finite()
+        """Whether a fit ends well: all is finite since the last window, and a step moved it."""
+        losses = _read_losses(self._losses)
+        stuck = self._best is None and 0 < len(losses) == model.skipped()
+        return all(map(math.isfinite, losses)) and not stuck and model.finite()
 
     def best(self) -> Any:
         """The state with the lowest loss; `DidNotConverge` if there was none."""
@@ -182,6 +194,7 @@ class Watchers:
             "best": self._best,
             "best_loss": self._best_loss,
             "before": self._before,
+            "skipped": self._skipped,
             "losses": _read_losses(self._losses),
             "plateau_losses": _read_losses(self._plateau_losses),
         }
@@ -190,6 +203,7 @@ class Watchers:
         """Go on from a saved state."""
         self.step, self._best = int(state["step"]), state["best"]
         self._best_loss, self._before = float(state["best_loss"]), float(state["before"])
+        self._skipped = int(state["skipped"])
         self._losses = [float(loss) for loss in state["losses"]]
         self._plateau_losses = [float(loss) for loss in state["plateau_losses"]]
 
@@ -233,7 +247,7 @@ def run_fit(
         next(batches)
     watchers = watchers or Watchers(fit.plateau_steps)
     threads = threads or StepThreads.of(fit.device, fit.shared_steps)
-    step = start
+    step, diverged = start, False
     report(step, fit.checkpoint(step))
     if budget.seconds is not None:
         budget = dataclasses.replace(budget, seconds=fit.seconds_for_steps(budget.seconds))
@@ -244,8 +258,8 @@ def run_fit(
                 break
             with threads.step():
                 loss = fit.step(next(batches), fraction)
-            if not watchers.watch(step + 1, loss, fit):
-                step = _go_back(fit, watchers, step)
+            diverged = not watchers.watch(step + 1, loss, fit)
+            if diverged:
                 break
             step += 1
             report.progress(step, steps)
@@ -256,8 +270,10 @@ def run_fit(
             if watchers.stands_still(loss):
                 fit.tell(f"The loss has stood still for {fit.plateau_steps} steps; finished early.")
                 break
-        if not watchers.sound(fit):
+        if diverged or not watchers.sound(fit):
             step = _go_back(fit, watchers, step)
+        elif skipped := fit.skipped():
+            fit.tell(f"{skipped} of {step} steps were skipped: a gradient was not finite.")
     return fit.finish(step, report.elapsed)
 
 

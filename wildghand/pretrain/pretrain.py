@@ -210,6 +210,10 @@ class JointFit(IterativeFit[tuple[dict[str, Tensor], int]]):
         """Whether every fitted number is finite."""
         return all(fit.model.finite() for fit in self.fits)
 
+    def skipped(self) -> int:
+        """See `IterativeFit`."""
+        return sum(fit.skipped() for fit in self.fits)
+
     def snapshot(self) -> dict[str, Tensor]:
         """A copy of all models that the fit no longer changes; shared weights are in it once."""
         return {name: value.detach().clone() for name, value in self._tensors().items()}
@@ -229,15 +233,17 @@ class JointFit(IterativeFit[tuple[dict[str, Tensor], int]]):
             "models": self._tensors(),
             "components": [fit.component_states() for fit in self.fits],
             "steps": [fit.descent.steps for fit in self.fits],
+            "skipped": [fit.descent.skipped for fit in self.fits],
             "optimizer": self.fits[0].descent.optimizer.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from a saved state."""
         self.restore(state["models"])
-        for fit, parts, steps in zip(self.fits, state["components"], state["steps"], strict=True):
+        own = (state["components"], state["steps"], state["skipped"])
+        for fit, parts, steps, skipped in zip(self.fits, *own, strict=True):
             fit.load_component_states(parts)
-            fit.descent.steps = int(steps)
+            fit.descent.steps, fit.descent.skipped = int(steps), skipped
         self.fits[0].descent.optimizer.load_state_dict(state["optimizer"])
 
     def _tensors(self) -> dict[str, Tensor]:

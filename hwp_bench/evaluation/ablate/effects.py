@@ -21,13 +21,13 @@ from hwp_bench.analysis.compare import (
     scope_title,
 )
 from hwp_bench.analysis.cost import seconds_table
-from hwp_bench.analysis.pairing import MethodRuns, common_metrics, scopes
+from hwp_bench.analysis.pairing import MethodRuns, common_metrics, scope_scores, scopes
 from hwp_bench.base.files import write_json
 from hwp_bench.base.records import flattened
 from hwp_bench.base.tables import Column, Table, to_object
 from hwp_bench.evaluation.ablate.runs import AblationEffect, AblationRuns, result_folder
 from hwp_bench.metrics import metric as metric_facts
-from hwp_bench.metrics.score import Scores, aggregate
+from hwp_bench.metrics.score import Scores, mean_scores
 from hwp_bench.report.tables import HEADLINE, PAPER
 from hwp_bench.results import CaptureResult
 from hwp_bench.results.schema import score_rows
@@ -280,19 +280,8 @@ def _score_columns(
 
 def _means(run: MethodRuns) -> dict[str, Scores]:
     """Return mean scores over seeds by scope."""
-    found: dict[str, list[Scores]] = {}
-    for result in run.seeds.values():
-        mean = aggregate(score_rows(result))
-        own = {"macro": mean.overall.macro, **mean.overall.perturbations}
-        for scope, summary in (("single", mean.single), ("interacting", mean.interacting)):
-            own[scope] = summary.capture_mean if summary else {}
-        for scope, scores in own.items():
-            if scores:
-                found.setdefault(scope, []).append(scores)
-    return {
-        scope: {name: sum(row[name] for row in rows) / len(rows) for name in rows[0]}
-        for scope, rows in found.items()
-    }
+    every = [scope_scores(score_rows(result)) for result in run.seeds.values()]
+    return {scope: mean_scores(one[scope] for one in every) for scope in every[0]}
 
 
 def _captures(run: MethodRuns) -> list[CaptureResult]:

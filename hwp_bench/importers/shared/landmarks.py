@@ -390,6 +390,32 @@ def read_landmarks(
     return Landmarks(np.where(usable, image, 0.0), np.where(usable, world, 0.0), score, detected)
 
 
+def read_sides(
+    path: str | os.PathLike[str],
+    side: str,
+    tracked: Association | None = None,
+    *,
+    min_score: float,
+) -> dict[str | None, Landmarks]:
+    """Read the landmarks of `right`, `left`, `both` or, by `auto`, the hands that a file holds.
+
+    The key is None where neither the file nor `side` says which hand it is. `tracked` is what
+    `read_association` returns, where it is known already.
+    """
+    sides: tuple[str | None, ...] = (side,)
+    if side not in SIDES:
+        tracked = tracked or read_association(path)
+        sides = (None,) if tracked is None else tracked.sides
+        if side == "both" and len(sides) < 2:
+            raise BadInput(
+                "has landmarks of one hand",
+                where=path,
+                field="--side",
+                remedy="Track the video with `hwp-bench data track`, or import one hand.",
+            )
+    return {side: read_landmarks(path, min_score=min_score, side=side) for side in sides}
+
+
 def check_against_video(
     landmarks: Landmarks, frame_count: int, width: int, height: int, where: str | os.PathLike[str]
 ) -> Landmarks:

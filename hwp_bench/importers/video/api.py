@@ -36,7 +36,12 @@ from hwp_bench.importers.video.masks import (
     cut_masks,
     project_clip,
 )
-from hwp_bench.importers.video.pictures import HandPictures, PictureResidual, TextureResidual
+from hwp_bench.importers.video.pictures import (
+    HandPictures,
+    PictureResidual,
+    SurfaceResidual,
+    TextureResidual,
+)
 from hwp_bench.importers.video.residuals import FIELD_SIZE, REACH, OutlineResidual
 from hwp_bench.importers.video.solve import (
     PICTURE_STEPS,
@@ -44,16 +49,15 @@ from hwp_bench.importers.video.solve import (
     Footage,
     ReprojectionError,
     fit_landmarks,
-    fit_outline,
-    fit_picture,
+    refine,
     reprojection_error,
     share_camera,
 )
 from hwp_bench.importers.video.source import (
+    FEW_FITTED,
     LOW_OVERLAP,
     VideoImport,
     VideoSource,
-    fit_warnings,
     landmark_doubts,
     read_source,
     refuse_other_units,
@@ -129,9 +133,13 @@ class ImportedClip:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Things to know before the capture is used; empty for a sound clip."""
-        fitted = {side: hand.parameters.valid for side, hand in self.hands.items()}
-        seen = {side: hand.landmarks.detected for side, hand in self.hands.items()}
-        said = [*self.doubts, *fit_warnings(fitted, seen)]
+        said = list(self.doubts)
+        for side, hand in self.hands.items():
+            fitted, seen = int(hand.parameters.valid.sum()), int(hand.landmarks.detected.sum())
+            if fitted < FEW_FITTED * seen:
+                said.append(
+                    f"the {side} hand is fitted in {fitted} of the {seen} frames that show it"
+                )
         if self.overlap < LOW_OVERLAP:
             said.append(
                 f"the overlap of mesh and mask is {self.overlap:.2f}, of a sound clip 0.9 and more"
@@ -289,10 +297,10 @@ def fit_video(
     if len(fits) == 2:
         for hand, fitted in enumerate(fits):
             fitted.landmarks.weaken(projected.trust(hand))
-    turns.fit_outlines(projected, masks)
-    turns.fit_outlines(*turns.cut(NARROW), texture=options.fit.texture)
+    turns.refine(projected, masks, "outline")
+    turns.refine(*turns.cut(NARROW), "outline", *["texture"] * options.fit.texture)
     if options.fit.picture_rounds > 0:
-        turns.fit_pictures(*turns.cut(NARROW))
+        turns.refine(*turns.cut(NARROW), "pictures")
     projected, masks = turns.cut(NARROW)
     imported = {}
     for (side, landmarks), fitted, clip, first in zip(
@@ -360,48 +368,32 @@ class _Turns:
             masks = cut_masks(images, projected, seen, size, trust, own, reduction, update)
         return projected, masks
 
-    def fit_outlines(
-        self, projected: ProjectedHands, masks: ClipMasks, *, texture: bool = False
-    ) -> None:
-        """Refine the hands by their outlines, and by their textures too."""
-        windows = self._source.windows
-        steps = self._settings.contour_rounds * self._settings.contour_steps
-        self._outlines += 1
-        title = f"fitting outlines ({self._outlines} of 2)"
+    def refine(self, projected: ProjectedHands, masks: ClipMasks, *kinds: str) -> None:
+        """Refine each hand by its `outline`, by that and its `texture`, or by whole `pictures`."""
+        source, fit = self._source, self._settings
+        if kinds == ("pictures",):
+            title, steps = "fitting pictures", fit.picture_rounds * PICTURE_STEPS
+        else:
+            self._outlines += 1
+            title = f"fitting outlines ({self._outlines} of 2)"
+            steps = fit.contour_rounds * fit.contour_steps
         with _steps(title, steps * len(self._fits)) as step:
-            pictures = self._pictures(projected, masks) if texture else None
-            for hand, (fitted, landmarks) in enumerate(
-                zip(self._fits, self._landmarks, strict=True)
-            ):
-                size = landmarks.hand_size
-                # Where the other hand is, the masks' outline is not this one's.
-                ignored = projected.covered(hand, REACH * size * FIELD_SIZE / windows.side)
-                outline = OutlineResidual(masks.fields, landmarks.detected, windows, size, ignored)
-                more = [] if pictures is None else [TextureResidual(pictures[hand], fitted.model)]
-                fit_outline(fitted, outline, *more, tick=step)
-
-    def fit_pictures(self, projected: ProjectedHands, masks: ClipMasks) -> None:
-        """Refine the hands' poses by whole pictures."""
-        steps = self._settings.picture_rounds * PICTURE_STEPS
-        with _steps("fitting pictures", steps * len(self._fits)) as step:
-            pictures = self._pictures(projected, masks)
-            for picture, fitted in zip(pictures, self._fits, strict=True):
-                fit_picture(fitted, PictureResidual(picture, fitted.model), step)
-
-    def _pictures(self, projected: ProjectedHands, masks: ClipMasks) -> list[HandPictures]:
-        """The frames as the fit of each hand sees them."""
-        visible = projected.coverage(masks.coverage)
-        return [
-            HandPictures(
-                images=self._source.images.frames,
-                masks=visible[hand],
-                usable=landmarks.detected,
-                windows=self._source.windows,
-                hand_size=landmarks.hand_size,
-                other=visible[1 - hand] if len(visible) == 2 else None,
-            )
-            for hand, landmarks in enumerate(self._landmarks)
-        ]
+            seen = [] if kinds == ("outline",) else projected.coverage(masks.coverage)
+            for hand, (fitted, tracked) in enumerate(zip(self._fits, self._landmarks, strict=True)):
+                size, windows = tracked.hand_size, source.windows
+                residuals: list[OutlineResidual | SurfaceResidual] = []
+                if "outline" in kinds:
+                    # Where the other hand is, the masks' outline is not this one's.
+                    ignored = projected.covered(hand, REACH * size * FIELD_SIZE / windows.side)
+                    residuals.append(
+                        OutlineResidual(masks.fields, tracked.detected, windows, size, ignored)
+                    )
+                if seen:
+                    other = seen[1 - hand] if len(seen) == 2 else None
+                    shown = source.images.frames, seen[hand], tracked.detected, windows, size, other
+                    kind = TextureResidual if "texture" in kinds else PictureResidual
+                    residuals.append(kind(HandPictures(*shown), fitted.model))
+                refine(fitted, *residuals, tick=step)
 
 
 def _check_output(out: Path, options: VideoImport) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -308,19 +308,14 @@ _HIDDEN_EDGE = 192
 
 
 @dataclass(frozen=True, eq=False)
-class ProjectedClip:
-    """The model of one hand projected into every frame."""
+class ProjectedClip(ProjectedHand):
+    """The model of one hand projected into every frame, in px of the whole frame.
 
-    #: (F, V, 3) float32 m, camera axes.
-    vertices: np.ndarray
-    #: (F, V, 2) float32, px of the whole frame.
-    pixels: np.ndarray
-    #: (F, 21, 2) float32, px of the whole frame, the tracker's offsets included.
-    landmarks: np.ndarray
+    Landmarks include the tracker's offsets.
+    """
+
     #: (F, 21) float32 m, of the landmarks.
     depths: np.ndarray
-    #: (T, 3) int64.
-    faces: np.ndarray
     #: Vertices of the open wrist.
     ring: np.ndarray
     #: Where the crops lie.
@@ -329,8 +324,7 @@ class ProjectedClip:
     def drawn(self) -> ProjectedHand:
         """The hand in the crops, as a sheet shows it."""
         pixels, landmarks = map(self.windows.place, (self.pixels, self.landmarks))
-        shown = np.ones(len(self.pixels), dtype=bool)
-        return ProjectedHand(self.vertices, pixels, landmarks, self.faces, shown)
+        return replace(self, pixels=pixels, landmarks=landmarks)
 
     def in_crop(self, frame: int, edge: int) -> np.ndarray:
         """(V, 2) px of the vertices in a frame's crop of `edge` px."""
@@ -348,9 +342,9 @@ def project_clip(model: ClipModel, windows: CropWindows) -> ProjectedClip:
         pixels = model.pixels(torch.as_tensor(vertices)).numpy()
         points = model.pose().landmarks
         landmarks, depths = model.pixels(points).numpy(), points[..., 2].numpy()
-    faces = model.template.faces
+    faces, everywhere = model.template.faces, np.ones(len(pixels), dtype=bool)
     ring = boundary_vertices(faces)
-    return ProjectedClip(vertices, pixels, landmarks, depths, faces, ring, windows)
+    return ProjectedClip(vertices, pixels, landmarks, faces, everywhere, depths, ring, windows)
 
 
 class ProjectedHands:

@@ -117,42 +117,6 @@ class Atlas:
         return image
 
 
-class MeanTexture:
-    """The mean of what the frames of a clip show at each texel, log grey without the light."""
-
-    #: Edge of the map, texels.
-    EDGE = 384
-    # Frames that a texel must have been seen in, each weighed by its facing squared.
-    _LEAST_WEIGHT = 5.0
-    # Log grey: a frame that differs from the mean by more counts less in the next mean.
-    _ODD = 0.06
-
-    def __init__(self, template: HandTemplate) -> None:
-        self.atlas = Atlas(template, self.EDGE)
-        self._mean: np.ndarray | None = None
-        self._sum, self._weight = (np.zeros(len(self.atlas)) for _ in range(2))
-
-    def add(self, values: np.ndarray, weights: np.ndarray) -> None:
-        """Count a frame's texels (K,) with weights (K,); those far from the last mean less."""
-        if self._mean is not None:
-            weights = weights / (1.0 + ((values - self._mean) / self._ODD) ** 2)
-        self._sum += weights * values
-        self._weight += weights
-
-    def finish(self) -> None:
-        """Form the mean of the frames added, and start again without any."""
-        mean = self._sum / (self._weight + 1.0)
-        self._mean = mean.astype(np.float32)
-        self._drawn = self.atlas.draw(self._mean)
-        self._known = self.atlas.draw_weights(self._weight)
-        self._sum, self._weight = (np.zeros(len(self.atlas)) for _ in range(2))
-
-    def expected(self, face: np.ndarray, mix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The mean at P points of the surface, and whether it is known there."""
-        places = self.atlas.places(face, mix)
-        return sample(self._drawn, places), sample(self._known, places) > self._LEAST_WEIGHT
-
-
 @dataclass(frozen=True, eq=False)
 class SeenTexels:
     """The texels that a frame shows, T of them."""
@@ -470,6 +434,12 @@ class TextureResidual(SurfaceResidual):
 
     #: Weight, and difference of a pixel that is still normal, log grey.
     WEIGHT, SCALE = 770.0, 0.06
+    #: Edge of the texture's map, texels.
+    EDGE = 384
+    # Frames that a texel must have been seen in, each weighed by its facing squared.
+    _LEAST_WEIGHT = 5.0
+    # Log grey: a frame that differs from the mean by more counts less in the next mean.
+    _ODD = 0.06
     # Changes wider than this share of the hand's size count as light, not as texture.
     _LIGHT_BREADTH = 0.05
     # Grey level added before the logarithm: noise of the dark pixels counts less.
@@ -480,7 +450,8 @@ class TextureResidual(SurfaceResidual):
 
     def __init__(self, pictures: HandPictures, model: ClipModel) -> None:
         super().__init__(pictures, model, self.WEIGHT)
-        self.texture = MeanTexture(model.template)
+        self.atlas = Atlas(model.template, self.EDGE)
+        self._mean: np.ndarray | None = None
 
     def view(self, frame: int, drawn: Drawn) -> PictureView:
         """Take the light off a frame."""
@@ -496,7 +467,7 @@ class TextureResidual(SurfaceResidual):
 
     def seen(self, frame: int, drawn: Drawn) -> tuple[np.ndarray, np.ndarray]:
         """Read a frame at each texel: (K,) log grey, and (K,) weights, zero where it is hidden."""
-        view, atlas = self.view(frame, drawn), self.texture.atlas
+        view, atlas = self.view(frame, drawn), self.atlas
         places = atlas.on_surface(drawn.pixels)
         depths = atlas.on_surface(drawn.vertices[:, 2:])
         facing = view.facing[atlas.face]
@@ -507,17 +478,24 @@ class TextureResidual(SurfaceResidual):
         return sample(view.detail, places), np.where(here, facing**2, 0.0)
 
     def collect(self, frames: list[int], seen: Iterable[tuple[np.ndarray, np.ndarray]]) -> None:
-        """Form the mean texture."""
+        """Form the mean at each texel; what is far from the mean before counts less."""
+        total, weight = (np.zeros(len(self.atlas)) for _ in range(2))
         for values, weights in seen:
-            self.texture.add(values, weights)
-        self.texture.finish()
+            if self._mean is not None:
+                weights = weights / (1.0 + ((values - self._mean) / self._ODD) ** 2)
+            total += weights * values
+            weight += weights
+        self._mean = (total / (weight + 1.0)).astype(np.float32)
+        self._drawn, self._known = self.atlas.draw(self._mean), self.atlas.draw_weights(weight)
 
     def expected(self, view: PictureView, drawn: Drawn) -> tuple[np.ndarray, np.ndarray]:
         """Draw the mean texture in a frame: (S, S) log grey, and (S, S) bool, whether it counts."""
         inside = view.region
         face = drawn.face[inside]
+        places = self.atlas.places(face, drawn.mix[inside])
         mean, known = np.zeros(inside.shape, np.float32), np.zeros(inside.shape, bool)
-        mean[inside], known[inside] = self.texture.expected(face, drawn.mix[inside])
+        mean[inside] = sample(self._drawn, places)
+        known[inside] = sample(self._known, places) > self._LEAST_WEIGHT
         known[inside] &= view.facing[face] > _LEAST_FACING
         return mean, known & view.core
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
@@ -12,8 +11,8 @@ import torch
 
 from hwp_bench.base.arrays import evenly
 from hwp_bench.base.console import notice
-from hwp_bench.base.errors import DidNotConverge
 from hwp_bench.hands import HandTemplate, load_template, pose_hand
+from hwp_bench.hands.fitting import minimize
 from hwp_bench.hands.skeleton import SIDES
 from hwp_bench.importers.shared.landmarks import LANDMARK_NAMES, Landmarks
 from hwp_bench.importers.video.model import ClipModel, PosedClip, rigid_start
@@ -28,7 +27,7 @@ PICTURE_STEPS = 40
 # Variables that are the same in all frames; they are held until every frame has found its pose.
 _CONSTANTS = ("betas", "offsets", "log_size", "log_focal")
 # Variables that the outline does not determine reliably.
-_HELD_BY_LANDMARKS = ("log_focal", "log_size")
+_HELD_BY_LANDMARKS: tuple[str, ...] = ("log_focal", "log_size")
 # Those that whole pictures would move to hide what else is wrong with them: the outline knows
 # how large a hand is and how far away.
 _HELD_BY_OUTLINE = (*_CONSTANTS, "log_depth")
@@ -45,8 +44,8 @@ _LEARNING_RATES = {
 }
 # Factor on them once a clip follows its landmarks: only corrections are left.
 _REFINING = 0.3
-# The rate rises over the first steps and ends at this share.
-_WARM_UP, _LAST_RATE = 20, 0.02
+# Steps over which the rate rises.
+_WARM_UP = 20
 
 #: Called after each step.
 Tick = Callable[[], None]
@@ -168,35 +167,19 @@ def share_camera(hands: Sequence[FittedClip], *, steps: int) -> None:
         descend(hand.model, hand.landmarks, steps, rate=_REFINING, hold=("log_focal",))
 
 
-def fit_outline(
+def refine(
     fitted: FittedClip, *residuals: OutlineResidual | SurfaceResidual, tick: Tick = _no_tick
 ) -> None:
-    """Refine a fit, in place, so that the mesh's outline meets the masks' outline.
+    """Refine a fit, in place, by residuals that are matched to the images in each round.
 
-    With a texture, what lies inside the outline meets the mean of all frames, too.
+    With an outline, the mesh's outline meets the masks'; with a texture, what lies inside meets the
+    mean of all frames. With whole pictures the lit hand, as it is drawn, meets the frames, and its
+    shape, size and distance stay.
     """
-    rounds, steps = fitted.settings.contour_rounds, fitted.settings.contour_steps
-    _refine(fitted, residuals, rounds, steps, _HELD_BY_LANDMARKS, tick)
-
-
-def fit_picture(fitted: FittedClip, picture: PictureResidual, tick: Tick = _no_tick) -> None:
-    """Refine the poses of a fit, in place, so that the lit hand, as it is drawn, meets the frames.
-
-    Shape, size and distance of the hand stay.
-    """
-    rounds = fitted.settings.picture_rounds
-    _refine(fitted, [picture], rounds, PICTURE_STEPS, _HELD_BY_OUTLINE, tick)
-
-
-def _refine(
-    fitted: FittedClip,
-    residuals: Sequence[OutlineResidual | SurfaceResidual],
-    rounds: int,
-    steps: int,
-    hold: tuple[str, ...],
-    tick: Tick,
-) -> None:
-    """Refine a fit, in place, by residuals that are matched to the images again in each round."""
+    chosen, hold = fitted.settings, _HELD_BY_LANDMARKS
+    rounds, steps = chosen.contour_rounds, chosen.contour_steps
+    if any(isinstance(residual, PictureResidual) for residual in residuals):
+        rounds, steps, hold = chosen.picture_rounds, PICTURE_STEPS, _HELD_BY_OUTLINE
 
     def energy(model: ClipModel, posed: PosedClip) -> torch.Tensor:
         value = fitted.landmarks(model, posed)
@@ -252,26 +235,16 @@ def descend(
         for field in fields(model.variables)
         if field.name not in hold
     ]
-    optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99))
-
-    def schedule(step: int) -> float:
-        fall = 0.5 * (1.0 + math.cos(math.pi * step / max(steps, 1)))
-        return min(1.0, (step + 1) / _WARM_UP) * (_LAST_RATE + (1.0 - _LAST_RATE) * fall)
-
-    scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, schedule)
+    remedy = "Check the landmarks; a focal length far off can do this too (--focal)."
     with _one_thread():
-        for step in range(steps):
-            optimizer.zero_grad(set_to_none=True)
-            loss = energy(model, model.pose())
-            if not math.isfinite(float(loss.detach())):
-                raise DidNotConverge(
-                    f"the fit of the hand left the finite numbers in step {step}",
-                    remedy="Check the landmarks; a focal length far off can do this too (--focal).",
-                )
-            loss.backward()
-            optimizer.step()
-            scheduler.step()
-            tick()
+        minimize(
+            groups,
+            lambda _: energy(model, model.pose()),
+            steps,
+            warm_up=_WARM_UP,
+            remedy=remedy,
+            tick=tick,
+        )
 
 
 @contextmanager

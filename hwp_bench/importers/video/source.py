@@ -26,12 +26,11 @@ from hwp_bench.capture.schema import MAX_FRAMES
 from hwp_bench.hands.skeleton import LANDMARK_EDGES, SIDES
 from hwp_bench.importers.shared.frames import CropWindows, cells, follow_hands
 from hwp_bench.importers.shared.landmarks import (
-    Association,
     Landmarks,
     check_against_video,
     read_association,
     read_hand_tracks,
-    read_landmarks,
+    read_sides,
 )
 from hwp_bench.importers.shared.output import CHOICES, check_choices
 from hwp_bench.importers.video.decode import (
@@ -159,7 +158,7 @@ def read_source(
     """Read and check everything that the import needs from outside."""
     info = probe(video)
     tracked = read_association(landmarks)
-    every = _read_hands(landmarks, tracked, options)
+    every = read_sides(landmarks, options.side, tracked, min_score=options.min_score)
     # Containers may state a wrong number of frames. A whole video is counted as it is decoded.
     # The end of a part is never read, so the header is trusted.
     part = options.frames.stop is not None
@@ -205,25 +204,6 @@ def read_source(
     return VideoSource(
         info, Path(landmarks), indices, hands, windows, images, own, *repaired, reading
     )
-
-
-def _read_hands(
-    path: str | os.PathLike[str], tracked: Association | None, options: VideoImport
-) -> dict[str | None, Landmarks]:
-    """Landmarks by side; the key is None where the file says nothing of it and nobody else."""
-    sides: tuple[str | None, ...]
-    if options.side in SIDES:
-        sides = (options.side,)
-    else:
-        sides = (None,) if tracked is None else tracked.sides
-        if options.side == "both" and len(sides) < 2:
-            raise BadInput(
-                "has landmarks of one hand",
-                where=path,
-                field="--side",
-                remedy="Track the video with `hwp-bench data track`, or import one hand.",
-            )
-    return {side: read_landmarks(path, min_score=options.min_score, side=side) for side in sides}
 
 
 def _check_memory(windows: CropWindows) -> None:
@@ -500,13 +480,3 @@ def refuse_unfitted(
             where=source.landmarks_path,
             remedy=CONVENTION + alone,
         )
-
-
-def fit_warnings(fitted: Mapping[str, np.ndarray], seen: Mapping[str, np.ndarray]) -> list[str]:
-    """Say of which hands few frames are fitted, of those in which they are seen: (F,) bool each."""
-    return [
-        f"the {side} hand is fitted in {int(good.sum())} of the {int(seen[side].sum())} frames "
-        "that show it"
-        for side, good in fitted.items()
-        if good.sum() < FEW_FITTED * seen[side].sum()
-    ]

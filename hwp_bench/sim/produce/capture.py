@@ -42,7 +42,14 @@ from hwp_bench.run.engine.processes import THREADS, LocalJob, Stopped, WorkerLos
 from hwp_bench.sim.effects import FramePlan, hands_at, plan_frame
 from hwp_bench.sim.hand.rigs import rig_path
 from hwp_bench.sim.produce.estimates import confused_mask, estimate_hands, estimate_mask
-from hwp_bench.sim.produce.free_view import has_free_view, write_free_view
+from hwp_bench.sim.produce.free_view import FRAMES as FREE_FRAMES
+from hwp_bench.sim.produce.free_view import (
+    add_free_view,
+    has_free_view,
+    read_waiting_free,
+    render_waiting_free,
+    write_free_view,
+)
 from hwp_bench.sim.produce.truth import distances, write_truth
 from hwp_bench.sim.render.frame import eight_bit_coverage, render_frame, write_layers
 from hwp_bench.sim.scene.scene import (
@@ -65,8 +72,9 @@ DEFAULT_SIZE = 256
 LICENCE = "CC0-1.0"
 #: Smallest and largest number of frames; smallest and largest edge of one, px; most processes.
 FRAMES, SIZES, MAX_WORKERS = (10, 100_000), (32, 1024), 1024
-# Frames below which a second process costs more than it saves.
-_FRAMES_PER_WORKER = 10
+# Frames below which a second process costs more than it saves: to start, to read the skin and to
+# build the hands takes it as long as 50 frames of 256 px, or 100 of 112 px.
+_FRAMES_PER_WORKER = 50
 _REMEDY = "Finished frames are kept; the same command continues from there."
 
 
@@ -162,7 +170,7 @@ class RenderRequest:
             elif not self.is_whole(output):
                 capture = open_capture(output)
                 clip = output / FREE_VIEW
-                write_free_view(self.checked().scene, clip, capture.info, capture.hands)
+                add_free_view(self.checked().scene, clip, capture.info, capture.hands)
 
     def is_whole(self, output: Path) -> bool:
         """Whether a folder holds a capture with all that is asked for."""
@@ -257,7 +265,10 @@ def _render(request: RenderRequest, out: Path, on_progress: OnProgress) -> None:
 def _render_missing(request: RenderRequest, waiting: Path, on_progress: OnProgress) -> None:
     scene = request.scene
     missing = [frame for frame in range(request.frames) if _read_frame(waiting, frame) is None]
-    if not missing:
+    free = range(FREE_FRAMES if request.free_view else 0)
+    unseen = [frame for frame in free if read_waiting_free(waiting, frame) is None]
+    left = len(missing) + len(unseen)
+    if not left:
         return
     # Built once here, so that no two processes paint the same skin.
     scene_hands(scene)
@@ -265,13 +276,18 @@ def _render_missing(request: RenderRequest, waiting: Path, on_progress: OnProgre
         skin_atlas(of_side(scene.subject, side))
     workers = request.workers
     if workers is None:
-        workers = max(1, min(os.cpu_count() or 1, len(missing) // _FRAMES_PER_WORKER))
-    works = [RenderFrames(request, missing[first::workers]) for first in range(workers)]
-    with progress(f"Rendering {scene.id}", len(missing)) as update:
+        workers = max(1, min(os.cpu_count() or 1, left // _FRAMES_PER_WORKER))
+    # The clip's frames are dealt out from the other end, so that every process has as many.
+    works = [
+        RenderFrames(request, missing[first::workers], unseen[workers - 1 - first :: workers])
+        for first in range(workers)
+    ]
+    every = request.frames + len(free)
+    with progress(f"Rendering {scene.id}", left) as update:
 
         def count(done: int, total: int) -> None:
             update(done)
-            on_progress(request.frames - len(missing) + done, request.frames)
+            on_progress(every - left + done, every)
 
         if workers == 1:
             works[0]({}, waiting, count)
@@ -287,12 +303,22 @@ class RenderFrames:
     request: RenderRequest
     #: Numbers of the frames.
     frames: Sequence[int]
+    #: Numbers of frames of the free-view clip.
+    free: Sequence[int] = ()
+
+    def __len__(self) -> int:
+        return len(self.frames) + len(self.free)
 
     def __call__(self, inputs: Mapping[str, Path], output: Path, on_progress: OnProgress) -> None:
         """Render; see `hwp_bench.run.engine.job.Work`."""
         for done, frame in enumerate(self.frames, start=1):
             render_waiting(self.request, frame, output)
-            on_progress(done, len(self.frames))
+            on_progress(done, len(self))
+        if self.free:
+            scene, edge = self.request.scene, self.request.edge
+            rendered = render_waiting_free(scene, self.free, edge, output)
+            for done, _ in enumerate(rendered, start=len(self.frames) + 1):
+                on_progress(done, len(self))
 
 
 def frame_file(folder: Path, frame: int) -> Path:
@@ -343,13 +369,13 @@ def _render_in_processes(
     def run(index: int) -> None:
         def count(steps: int, total: int) -> None:
             done[index] = steps
-            on_progress(sum(done), sum(len(work.frames) for work in works))
+            on_progress(sum(done), sum(map(len, works)))
 
         # One thread each: the processes share the processors.
         job = LocalJob(works[index], {}, folder.absolute(), dict.fromkeys(THREADS, "1"))
         try:
             run_in_process(job, count, stop.is_set)
-            count(len(works[index].frames), 0)
+            count(len(works[index]), 0)
         except BaseException:
             stop.set()
             raise
@@ -413,7 +439,7 @@ def _assemble(request: RenderRequest, waiting: Path, out: Path, seconds: float) 
             writer.extra("subject.json", canonical_json(rows))
         writer.extra("cost.json", json.dumps({"wall_seconds": round(seconds, 3), "frames": costs}))
         if request.free_view:
-            write_free_view(scene, writer.folder / FREE_VIEW, info, estimates)
+            write_free_view(scene, writer.folder / FREE_VIEW, info, estimates, waiting)
 
 
 def _video(scene: Scene, waiting: Path, info: CaptureInfo, name: str) -> Iterator[np.ndarray]:

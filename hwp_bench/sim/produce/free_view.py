@@ -7,6 +7,7 @@ that it measures the avatar alone.
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -15,8 +16,11 @@ from typing import Any
 
 import numpy as np
 
+from hwp_bench.base.arrays import read_npz
 from hwp_bench.base.console import progress
-from hwp_bench.base.errors import HwpError
+from hwp_bench.base.errors import BadInput, HwpError
+from hwp_bench.base.files import atomic_write
+from hwp_bench.base.folders import scratch_folder
 from hwp_bench.base.numerics import kd_tree
 from hwp_bench.capture import Cameras, CaptureInfo, CaptureWriter, open_capture
 from hwp_bench.capture.schema import FREE_VIEW, MAX_ID
@@ -242,24 +246,78 @@ def has_free_view(capture: Path) -> bool:
     return clip.info.source.get("version") == VERSION
 
 
-def write_free_view(
+def free_file(folder: Path, frame: int) -> Path:
+    """Path of a frame of the clip that waits for its capture."""
+    return folder / f"free{VERSION}-{frame:06d}.npz"
+
+
+def render_waiting_free(
+    scene: Scene, frames: Sequence[int], size: int, folder: Path
+) -> Iterator[int]:
+    """Render frames of the clip into the folder where they wait; gives the number of each."""
+    gain, views = steady_gain(scene, RenderCost()), free_views(scene)
+    for frame in frames:
+        cost = RenderCost()
+        item, rgb, coverage = render_free(scene, views[frame], size, gain, cost)
+        spent = json.dumps({"seconds": dict(cost.seconds), "rays": dict(cost.rays)})
+        buffer = io.BytesIO()
+        np.savez(
+            buffer,
+            rgb=rgb,
+            coverage=eight_bit_coverage(coverage),
+            view=item.view,
+            cost=np.frombuffer(spent.encode(), dtype=np.uint8),
+        )
+        atomic_write(free_file(folder, frame), buffer.getvalue())
+        yield frame
+
+
+def read_waiting_free(folder: Path, frame: int) -> dict[str, np.ndarray] | None:
+    """Read a frame of the clip that waits; None if it is missing or damaged."""
+    try:
+        return read_npz(free_file(folder, frame))
+    except BadInput:
+        return None
+
+
+def add_free_view(
     scene: Scene, folder: Path, info: CaptureInfo, estimates: Mapping[str, HandParameters]
 ) -> None:
-    """Render the clip of a capture into a folder.
+    """Render the clip of a capture that exists into a folder."""
+    with (
+        scratch_folder("hwp-free-") as waiting,
+        progress(f"Rendering the free view of {scene.id}", FRAMES) as update,
+    ):
+        for frame in render_waiting_free(scene, range(FRAMES), info.width, waiting):
+            update(frame + 1)
+        write_free_view(scene, folder, info, estimates, waiting)
+
+
+def write_free_view(
+    scene: Scene,
+    folder: Path,
+    info: CaptureInfo,
+    estimates: Mapping[str, HandParameters],
+    waiting: Path,
+) -> None:
+    """Write the clip of a capture into a folder, of the frames that wait in another one.
 
     It has the betas of the capture's estimates, because an avatar has one shape; angles are true,
     and the middle of the palm is in its true place. `truth/hands.npz` has the true betas too.
     """
-    cost = RenderCost()
-    gain = steady_gain(scene, cost)
-    views = free_views(scene)
-    size = info.width
+    views, size, cost = free_views(scene), info.width, RenderCost()
     pictures = []
-    with progress(f"Rendering the free view of {scene.id}", len(views)) as update:
-        for done, item in enumerate(views, start=1):
-            pictures.append(render_free(scene, item, size, gain, cost))
-            update(done)
-    views = [view for view, _, _ in pictures]
+    for frame, item in enumerate(views):
+        arrays = read_waiting_free(waiting, frame)
+        if arrays is None:
+            problem = f"frame {frame} of the free view was lost before the capture was whole"
+            raise HwpError(problem, where=waiting, remedy="Start again: what is there is kept.")
+        views[frame] = FreeView(item.hands, arrays["view"])
+        pictures.append((arrays["rgb"], arrays["coverage"]))
+        spent = json.loads(arrays["cost"].tobytes())
+        cost.rays.update(spent["rays"])
+        for name, seconds in spent["seconds"].items():
+            cost.seconds[name] += seconds
     cameras = Cameras(
         Ks=np.repeat(intrinsics(scene, size)[None], len(views), axis=0),
         viewmats=np.stack([item.view for item in views]),
@@ -268,10 +326,10 @@ def write_free_view(
     moments = [item.hands for item in views]
     given, truth = (parameters_of(scene, moments, shapes) for shapes in (betas, None))
     with CaptureWriter(folder, _info(info, len(views)), given, cameras, overwrite=True) as writer:
-        for frame, (_, rgb, coverage) in enumerate(pictures):
+        for frame, (rgb, coverage) in enumerate(pictures):
             writer.frame(frame, rgb)
-            writer.mask(frame, eight_bit_coverage(coverage))
-            writer.true_mask(frame, eight_bit_coverage(coverage))
+            writer.mask(frame, coverage)
+            writer.true_mask(frame, coverage)
         writer.true_hands(truth)
         spent = {"seconds": dict(cost.seconds), "rays": dict(cost.rays)}
         writer.extra("cost.json", json.dumps(spent))

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from hwp_bench.base.console import track
-from hwp_bench.base.errors import MissingDependency, UsageError
+from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import atomic_write
 from hwp_bench.base.images import write_image
+from hwp_bench.base.scene3d import SideView, drawn, frustum_mesh, surface_mesh
 from hwp_bench.sim.effects import hands_at, lights_at, objects_at, plan_frame
-from hwp_bench.sim.geometry.surface import RenderCost, Surface
+from hwp_bench.sim.geometry.surface import RenderCost
 from hwp_bench.sim.light.lights import focus_point
 from hwp_bench.sim.render.frame import SimulatedFrame, render_frame
 from hwp_bench.sim.render.stage import RenderStage
-from hwp_bench.sim.scene.scene import Scene, viewmat
+from hwp_bench.sim.scene.scene import Scene, intrinsics, viewmat
 from hwp_bench.sim.subject.hand import MOVING
 from hwp_bench.taxonomy import perturbation
 
@@ -86,20 +86,16 @@ def _animation(results: list[SimulatedFrame]) -> bytes:
     return buffer.getvalue()
 
 
-#: Edge of the image in pixels.
-EDGE = 900
 # Moments of the camera's path that are drawn.
 _PATH = 200
+# How deep the camera's pyramid is drawn, and how far from the hands the lamp, m.
+_DEPTH, _LAMP = 0.2, 0.25
 
 
 def draw_stage(scene: Scene, folder: Path) -> Path:
     """Write `ID-stage.png`: the busiest frame of the scene, seen from the side."""
-    try:
-        import pyvista
-    except ImportError as error:
-        raise MissingDependency(
-            "the stage is drawn by pyvista", remedy="pip install 'hwp-bench[preview]'"
-        ) from error
+    import pyvista
+
     plans = [plan_frame(scene, frame, 100, 256) for frame in range(100)]
     recipe = max(plans, key=lambda item: ("objects" in item.passes, sum(item.severity.values())))
     stage = RenderStage(scene, RenderCost())
@@ -109,45 +105,27 @@ def draw_stage(scene: Scene, folder: Path) -> Path:
     views = [viewmat(scene, moment * scene.duration) for moment in np.linspace(0.0, 1.0, _PATH)]
     path = np.array([-view[:3, :3].T @ view[:3, 3] for view in views])
     out = folder / f"{scene.id}-stage.png"
-    folder.mkdir(parents=True, exist_ok=True)
-    try:
-        plotter = pyvista.Plotter(off_screen=True, window_size=[EDGE, EDGE])
-        plotter.add_mesh(_mesh(stage.surface(hands, MOVING)), color="#d8a888", smooth_shading=True)
+    focus = focus_point()
+    lamp = focus + _LAMP * lights.direction
+    with drawn(out, stage_side()) as plotter:
+        surface = stage.surface(hands, MOVING)
+        mesh = surface_mesh(surface.vertices, surface.faces)
+        plotter.add_mesh(mesh, color="#d8a888", smooth_shading=True)
         if things is not None:
-            plotter.add_mesh(_mesh(things.surface), color="#4477aa")
-        focus = focus_point()
-        lamp = focus + 0.25 * lights.direction
+            mesh = surface_mesh(things.surface.vertices, things.surface.faces)
+            plotter.add_mesh(mesh, color="#4477aa")
         plotter.add_mesh(pyvista.Sphere(radius=0.012, center=lamp), color="#ffcc33", lighting=False)
         plotter.add_mesh(pyvista.Line(lamp, focus), color="#ffcc33", line_width=2)
-        plotter.add_mesh(_frustum(scene), color="#666666", style="wireframe")
+        camera = frustum_mesh(intrinsics(scene, 1), np.eye(4), 1, 1, _DEPTH)
+        plotter.add_mesh(camera, color="#666666", style="wireframe", lighting=False)
         if scene.camera.handheld:
-            plotter.add_mesh(pyvista.lines_from_points(path), color="#cc3311", line_width=3)
-        eye = focus + np.array([1.25, -0.55, -0.45])
-        plotter.camera_position = [eye, focus + np.array([0.0, 0.05, -0.22]), (0.0, -1.0, 0.0)]
-        plotter.screenshot(str(out))
-        plotter.close()
-    except (RuntimeError, OSError) as error:
-        raise MissingDependency(
-            f"the stage cannot be drawn ({error})",
-            remedy="It needs OpenGL: a display, or a VTK build with OSMesa or EGL.",
-        ) from error
+            line = pyvista.lines_from_points(path)
+            plotter.add_mesh(line, color="#cc3311", line_width=3, lighting=False)
     return out
 
 
-def _mesh(surface: Surface) -> Any:
-    import pyvista
-
-    count = len(surface.faces)
-    cells = np.column_stack([np.full(count, 3), surface.faces])
-    return pyvista.PolyData(surface.vertices, cells.reshape(-1))
-
-
-def _frustum(scene: Scene) -> Any:
-    import pyvista
-
-    slope = np.tan(np.radians(scene.camera.field_of_view) / 2.0)
-    far = 0.2 * np.array([[x * slope, y * slope, 1.0] for x in (-1, 1) for y in (-1, 1)])
-    points = np.vstack([np.zeros((1, 3)), far])
-    faces = [[0, 1, 2], [0, 2, 4], [0, 4, 3], [0, 3, 1]]
-    cells = np.array([[3, *face] for face in faces]).reshape(-1)
-    return pyvista.PolyData(points, cells)
+def stage_side() -> SideView:
+    """The side from which a stage is seen."""
+    focus = focus_point()
+    eye = focus + np.array([1.25, -0.55, -0.45])
+    return SideView(eye, focus + np.array([0.0, 0.05, -0.22]), np.array([0.0, -1.0, 0.0]))

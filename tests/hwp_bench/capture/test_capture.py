@@ -277,7 +277,7 @@ def test_a_damaged_hand_template_is_reported(
     vertices = free_right.vertices.copy()
     vertices[faces[middle]] = vertices[faces[middle, 0]]
     assert "without an area" in mesh_problems(replace(free_right, vertices=vertices))[0]
-    monkeypatch.setattr("hwp_bench.capture.reader.Capture.template", lambda *_: turned)
+    monkeypatch.setattr("hwp_bench.capture.folder.Capture.template", lambda *_: turned)
     report = check_capture(capture.root)
     assert report.ok
     assert [finding.problem for finding in report.findings] == [

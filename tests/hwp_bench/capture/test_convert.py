@@ -22,8 +22,7 @@ from hwp_bench.capture.convert import (
     with_one_shape,
     write_meshes,
 )
-from hwp_bench.capture.reader import load_matching_template
-from hwp_bench.capture.writer import rewrite_capture
+from hwp_bench.capture.folder import load_matching_template, rewrite_capture
 from hwp_bench.cli.main import main
 from hwp_bench.hands import HandParameters, HandTemplate, pose_hand
 

@@ -6,17 +6,9 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.path import Path as Polygon
+from synthetic_clip import disc
 
 from hwp_bench.hands.raster import draw_faces, draw_silhouette, mix_corners
-
-
-def disc(centre: np.ndarray, radius: float, corners: int = 120) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (centre first) and faces of a disc."""
-    angle = np.arange(corners) * 2 * np.pi / corners
-    rim = centre + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    index = np.arange(corners)
-    faces = np.stack([0 * index, 1 + index, 1 + (index + 1) % corners], axis=1)
-    return np.concatenate([centre[None], rim]), faces
 
 
 @settings(deadline=None)  # the first call compiles

@@ -35,8 +35,7 @@ from hwp_bench.tracking.networks import (
     models_folder,
     read_members,
 )
-from hwp_bench.tracking.track_video import track_frames
-from hwp_bench.tracking.tracker import TrackerSettings
+from hwp_bench.tracking.track_video import TrackerSettings, track_frames
 
 CLIP = Path(__file__).resolve().parents[4] / "shared" / "data" / "real_hand"
 

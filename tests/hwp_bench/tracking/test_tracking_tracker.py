@@ -8,8 +8,7 @@ from fake_networks import LAYOUT, RADIUS, FakeNetworks, picture
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.importers.shared.landmarks import HandTracks
-from hwp_bench.tracking.track_video import track_frames
-from hwp_bench.tracking.tracker import TrackerSettings
+from hwp_bench.tracking.track_video import TrackerSettings, track_frames
 
 Clip = list[dict[str, tuple[float, float]]]
 

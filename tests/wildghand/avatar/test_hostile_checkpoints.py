@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from hostile import Exploit
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 
@@ -17,16 +18,6 @@ from hwp_bench.base.errors import BadInput
 from wildghand.fitting.choice import Averaging, StateChoice
 from wildghand.fitting.session import SCHEMA, load_state
 from wildghand.gaussians.perceptual import Vgg19
-
-
-class Exploit:
-    """Pickled, it asks for a call that leaves a file behind."""
-
-    def __init__(self, marker: Path) -> None:
-        self.marker = marker
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return Path.touch, (self.marker,)
 
 
 @pytest.mark.parametrize("reader", ["state", "weights"])

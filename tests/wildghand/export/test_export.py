@@ -19,6 +19,7 @@ import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from splat_files import read_ply
 from splat_transform import transform, validation_errors
 from tiny_fits import TINY
 
@@ -48,27 +49,6 @@ from wildghand.export.splats import (
 def fitted(make_painted: Callable[..., Capture]) -> tuple[WildGHandAvatar, Capture]:
     capture = make_painted()
     return wildghand.fit(capture.root, settings=TINY, steps=2, all_frames=True), capture
-
-
-def read_ply(path: Path) -> PosedGaussians:
-    """A reader of its own: the properties by the names in the header."""
-    header, _, body = path.read_bytes().partition(b"end_header\n")
-    lines = header.decode("ascii").splitlines()
-    count = next(int(line.split()[2]) for line in lines if line.startswith("element vertex"))
-    names = [line.split()[2] for line in lines if line.startswith("property float")]
-    table = np.frombuffer(body, "<f4").reshape(count, len(names))
-    column = dict(zip(names, table.T, strict=True))
-
-    def stacked(*keys: str) -> np.ndarray:
-        return np.stack([column[key] for key in keys], axis=1)
-
-    return PosedGaussians(
-        means=stacked("x", "y", "z"),
-        quats=stacked("rot_0", "rot_1", "rot_2", "rot_3"),
-        scales=np.exp(stacked("scale_0", "scale_1", "scale_2")),
-        opacities=1.0 / (1.0 + np.exp(-column["opacity"])),
-        colors=0.5 + SH_CONSTANT * stacked("f_dc_0", "f_dc_1", "f_dc_2"),
-    )
 
 
 def turns(quats: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ frames, torch's own optimizer.
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -16,13 +17,16 @@ from odd_fits import odd_fit, part
 from painted import TrainingMaker
 from tiny_fits import TINY
 
+from hwp_bench.capture import HandModelId
 from hwp_bench.hands import pose_hand, project
 from hwp_bench.methods.contract import Budget, TrainingCapture
 from wildghand.fitting.fit import Component, Fit, StepBatch
 from wildghand.fitting.method import affordable
 from wildghand.fitting.objective import Reconstruction, Regularisers, choose_perceptual
+from wildghand.fitting.start import StartFromPrior
 from wildghand.fitting.weights import Pao
 from wildghand.gaussians.regularizers import surface_laplacian
+from wildghand.model.settings import read_settings
 
 ROWS = torch.tensor([0, 3])
 
@@ -238,3 +242,17 @@ def test_steps_leave_the_geometry_branch_out_by_the_chance_that_is_set(
     # The avatar itself, and frames that are looked at, have all of it.
     looked = fit.draw(StepBatch(rows)).hands["right"].prediction.raw.concatenate()
     assert not any(torch.allclose(frame, alone, atol=1e-6) for frame in looked)
+
+
+def test_a_fit_of_the_papers_network_says_that_it_starts_from_random_weights() -> None:
+    for size, expected in (("paper", 1), ("compact", 0)):
+        said: list[str] = []
+        fit = SimpleNamespace(
+            settings=read_settings({"network.size": size}),
+            data=SimpleNamespace(training=SimpleNamespace(hand_model=HandModelId("x", "0" * 64))),
+            model=SimpleNamespace(network=None),
+            tell=said.append,
+        )
+        StartFromPrior().before(fit)  # type: ignore[arg-type]
+        assert len(said) == expected
+        assert all("random weights" in text for text in said)

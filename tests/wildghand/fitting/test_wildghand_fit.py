@@ -6,6 +6,7 @@ before it was written.
 
 from __future__ import annotations
 
+import itertools
 import shutil
 from collections.abc import Callable
 from dataclasses import asdict, replace
@@ -33,6 +34,7 @@ from wildghand.fitting.components import make_fit
 from wildghand.fitting.method import WildGHandMethod
 from wildghand.fitting.parallel import World
 from wildghand.fitting.session import load_state, save_state
+from wildghand.gaussians.adam import ClippedAdam
 from wildghand.model.model import WildGHandModel
 from wildghand.model.settings import read_settings
 from wildghand.plain.loop import Watchers, run_fit
@@ -161,6 +163,67 @@ def test_rates_far_too_high_stop_with_a_message_or_keep_the_best(
     assert avatar.model.finite()
     if avatar.steps < 150:
         assert "the state of step" in capsys.readouterr().err
+
+
+@pytest.fixture
+def spoil_gradients(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[int], bool]], None]:
+    """Makes one number of a gradient infinite in the steps that a function names."""
+
+    def spoil(spoiled: Callable[[int], bool]) -> None:
+        take, steps = ClippedAdam.take_step, itertools.count()
+
+        def spoil_and_take(optimizer: ClippedAdam, loss: torch.Tensor) -> torch.Tensor:
+            if spoiled(next(steps)):
+                (group, *_) = optimizer.param_groups
+                group["params"][0].grad.view(-1)[-1] = np.inf
+            return take(optimizer, loss)
+
+        monkeypatch.setattr(ClippedAdam, "take_step", spoil_and_take)
+
+    return spoil
+
+
+BARE: dict[str, Any] = {"mode": "bare", "gaussians": 200}
+
+
+@pytest.mark.parametrize("steps", [5, 60])
+def test_a_fit_whose_every_gradient_is_infinite_ends_as_diverged(
+    steps: int,
+    make_training: TrainingMaker,
+    spoil_gradients: Callable[..., None],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    training = make_training()
+    spoil_gradients(lambda step: True)
+    with pytest.raises(DidNotConverge, match="diverged within its first 50 steps"):
+        fitted(training, steps, **BARE)
+    assert capsys.readouterr().err == ""
+
+
+def test_gradients_that_turn_infinite_end_a_fit_at_its_last_good_state(
+    make_training: TrainingMaker,
+    spoil_gradients: Callable[..., None],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    training = make_training()
+    spoil_gradients(lambda step: step >= 50)
+    avatar = fitted(training, 120, **BARE)
+    assert avatar.steps == 50
+    assert capsys.readouterr().err.count("The fit diverged") == 1
+
+
+def test_a_few_skipped_steps_are_said_once(
+    make_training: TrainingMaker,
+    spoil_gradients: Callable[..., None],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    training = make_training()
+    spoil_gradients(lambda step: step in (2, 5))
+    avatar = fitted(training, 8, **BARE)
+    assert avatar.steps == 8
+    assert avatar.model.finite()
+    said = capsys.readouterr().err.split("\n")
+    assert said == ["2 of 8 steps were skipped: a gradient was not finite.", ""]
 
 
 def test_an_avatar_is_read_as_it_was_written(make_training: TrainingMaker, tmp_path: Path) -> None:

@@ -19,8 +19,22 @@ def model() -> PlainModel:
     return painted_avatar(("right",)).model
 
 
-def watch_window(guard: Watchers, model: PlainModel, start: int, loss: float) -> list[bool]:
-    return [guard.watch(start + i, loss, model) for i in range(WINDOW)]
+class Fitted:
+    """A model as the watchers see a fit, and the steps that it says it has skipped."""
+
+    def __init__(self, model: PlainModel, skipped: int = 0) -> None:
+        self.finite, self.snapshot = model.finite, model.snapshot
+        self.number = skipped
+
+    def skipped(self) -> int:
+        return self.number
+
+
+def watch_window(
+    guard: Watchers, model: PlainModel, start: int, loss: float, skipped: int = 0
+) -> list[bool]:
+    fitted = Fitted(model, skipped)
+    return [guard.watch(start + i, loss, fitted) for i in range(WINDOW)]
 
 
 def test_falling_loss_is_fine_and_the_last_window_is_kept(model: PlainModel) -> None:
@@ -64,11 +78,31 @@ def test_a_parameter_that_is_no_number_is_divergence(model: PlainModel) -> None:
 def test_a_model_that_is_broken_since_the_last_window_is_not_sound(model: PlainModel) -> None:
     guard = Watchers()
     watch_window(guard, model, 0, 1.0)
-    guard.watch(WINDOW, 0.9, model)
-    assert guard.sound(model)
+    guard.watch(WINDOW, 0.9, Fitted(model))
+    assert guard.sound(Fitted(model))
     broken = model.snapshot()
     broken.gaussians.offsets[3, 1] = math.nan
-    assert not guard.sound(broken)
+    assert not guard.sound(Fitted(broken))
+
+
+def test_a_window_of_skipped_steps_alone_is_divergence(model: PlainModel) -> None:
+    guard = Watchers()
+    assert all(watch_window(guard, model, 0, 1.0, skipped=WINDOW - 1))
+    assert all(watch_window(guard, model, WINDOW, 1.0, skipped=2 * WINDOW - 2))
+    assert not all(watch_window(guard, model, 2 * WINDOW, 1.0, skipped=3 * WINDOW - 2))
+    assert guard.step == WINDOW - 1
+    again = Watchers()
+    again.load_state_dict(guard.state_dict())
+    assert all(watch_window(again, model, 3 * WINDOW, 1.0, skipped=3 * WINDOW - 2))
+
+
+def test_a_short_fit_that_skipped_every_step_is_not_sound(model: PlainModel) -> None:
+    guard = Watchers()
+    assert guard.sound(Fitted(model))
+    for step in range(3):
+        guard.watch(step, 1.0, Fitted(model))
+    assert guard.sound(Fitted(model, 2))
+    assert not guard.sound(Fitted(model, 3))
 
 
 def test_without_any_good_state_there_is_only_the_error() -> None:

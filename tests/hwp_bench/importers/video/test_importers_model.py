@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from synthetic_clip import FOCAL, HEIGHT, WIDTH, make_clip
+from synthetic_clip import FOCAL, HEIGHT, WIDTH, make_clip, with_correctives
 
-from hwp_bench.hands.template import rebuilt
 from hwp_bench.importers.video.model import (
     FRAME_VARIABLES,
     ClipModel,
@@ -23,10 +22,7 @@ CENTRE = np.array([WIDTH / 2, HEIGHT / 2])
 def bent_model(*, correctives: bool = False) -> ClipModel:
     """Three frames with every variable away from zero."""
     clip = make_clip(3)
-    hand = clip.template
-    if correctives:
-        basis = np.random.default_rng(0).normal(0, 1e-3, (len(hand.vertices), 3, 135))
-        hand = rebuilt(hand, pose_basis=basis)
+    hand = with_correctives(clip.template) if correctives else clip.template
     start = rigid_start(clip.landmarks, hand_landmarks(clip.joints), FOCAL, CENTRE)
     model = ClipModel(hand, start, FOCAL, CENTRE)
     generator = torch.Generator().manual_seed(0)

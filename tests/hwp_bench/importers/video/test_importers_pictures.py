@@ -35,7 +35,7 @@ from hwp_bench.importers.video.pictures import (
     smooth_within,
 )
 from hwp_bench.importers.video.residuals import OutlineResidual, signed_distance
-from hwp_bench.importers.video.solve import FittedClip, fit_outline, fit_picture
+from hwp_bench.importers.video.solve import FittedClip, refine
 
 
 def texture_of(fitted: FittedClip) -> TextureResidual:
@@ -49,7 +49,7 @@ def test_a_painted_hand_comes_nearer_to_its_truth_than_by_its_outline() -> None:
     for painted in (False, True):
         fitted = fit_to_errors()
         contour = OutlineResidual(fields, clip.landmarks.detected, windows, HAND)
-        fit_outline(fitted, contour, *([texture_of(fitted)] if painted else []))
+        refine(fitted, contour, *([texture_of(fitted)] if painted else []))
         errors.append(pixel_error(fitted))
     # 0.78 and 0.93 px when this was written.
     assert errors[1] < 0.92 * errors[0]
@@ -103,11 +103,11 @@ def test_a_lit_hand_comes_nearer_to_its_truth_than_by_outline_and_texture() -> N
     fitted = fit_to_errors()
     contour = OutlineResidual(fields, clip.landmarks.detected, windows, HAND)
     texture = TextureResidual(pictures(lit=True), fitted.model)
-    fit_outline(fitted, contour, texture)
+    refine(fitted, contour, texture)
     before, free = pixel_error(fitted), fitted.model.variables
     held = {name: getattr(free, name).detach().clone() for name in ("betas", "log_depth")}
     done: list[int] = []
-    fit_picture(fitted, picture_of(fitted), lambda: done.append(1))
+    refine(fitted, picture_of(fitted), tick=lambda: done.append(1))
     # 0.75 and 0.61 px when this was written.
     assert pixel_error(fitted) < 0.88 * before
     assert len(done) == 120

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from synthetic_clip import FOCAL, HEIGHT, WIDTH, make_clip, template
+from synthetic_clip import FOCAL, HEIGHT, WIDTH, disc, make_clip, template
 
 from hwp_bench.hands.articulation import joint_axes
 from hwp_bench.hands.template import boundary_vertices
@@ -19,15 +19,6 @@ from hwp_bench.importers.video.residuals import (
     template_spheres,
     touching_pairs,
 )
-
-
-def disc(centre: np.ndarray, radius: float, corners: int = 120) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (centre first) and faces of a disc."""
-    angle = np.arange(corners) * 2 * np.pi / corners
-    rim = centre + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    index = np.arange(corners)
-    faces = np.stack([0 * index, 1 + index, 1 + (index + 1) % corners], axis=1)
-    return np.concatenate([centre[None], rim]), faces
 
 
 def disc_mask(centre: np.ndarray, radius: float, size: int = FIELD_SIZE) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +17,14 @@ from synthetic_clip import (
     WIDTH,
     SyntheticClip,
     make_clip,
+    with_correctives,
     write_landmarks,
     write_video,
 )
 
 from hwp_bench.base.errors import DidNotConverge
 from hwp_bench.hands import pose_hand
-from hwp_bench.hands.template import rebuilt
+from hwp_bench.hands.skinning import pose_parameters
 from hwp_bench.importers.shared.frames import cut, follow_hands
 from hwp_bench.importers.shared.landmarks import Landmarks, read_landmarks
 from hwp_bench.importers.video.model import (
@@ -39,7 +41,7 @@ from hwp_bench.importers.video.solve import (
     SideScores,
     SolveSettings,
     fit_landmarks,
-    fit_outline,
+    refine,
     reprojection_error,
     side_scores,
     warn_of_contradiction,
@@ -63,9 +65,7 @@ def clean_fit() -> tuple[SyntheticClip, FittedClip]:
 
 def joints(clip: SyntheticClip, fitted: FittedClip) -> np.ndarray:
     hand = fitted.model.parameters(clip.landmarks.detected)
-    tensors = clip.template.to_torch(torch.float64)
-    parts = (torch.from_numpy(part) for part in (hand.pose, hand.betas, hand.transl))
-    return pose_hand(tensors, *parts).landmarks.numpy()
+    return pose_parameters(clip.template, hand).landmarks.numpy()
 
 
 def test_the_start_of_a_rigid_hand_is_exact() -> None:
@@ -110,8 +110,7 @@ def test_noise_is_smoothed() -> None:
     rng = np.random.default_rng(0)
     image = clip.landmarks.image + rng.normal(0, 2, clip.landmarks.image.shape)
     world = clip.landmarks.world + rng.normal(0, 0.004, clip.landmarks.world.shape)
-    noisy = Landmarks(image, world, clip.landmarks.score, clip.landmarks.detected)
-    fitted = fit(clip, noisy)
+    fitted = fit(clip, replace(clip.landmarks, image=image, world=world))
     with torch.no_grad():
         track = fitted.model.pixels(fitted.model.pose().landmarks).numpy()
     assert np.abs(np.diff(track, 2, axis=0)).mean() < np.abs(np.diff(image, 2, axis=0)).mean() / 3
@@ -125,7 +124,7 @@ def test_gaps_and_outliers_do_no_harm() -> None:
     image[~detected] = 0.0
     image[20, 8] += 60.0
     image[6] += np.random.default_rng(0).normal(0, 25, (21, 2))
-    broken = Landmarks(image, clip.landmarks.world, clip.landmarks.score, detected)
+    broken = replace(clip.landmarks, image=image, detected=detected)
     fitted = fit(clip, broken)
     hand = fitted.model.parameters(detected)
     assert np.isfinite(hand.pose).all()
@@ -189,10 +188,7 @@ def test_interpolation_holds_the_ends() -> None:
 def test_outline_vertices_are_those_of_the_hand_model(correctives: bool) -> None:
     # The contour term poses a few vertices by itself; `pose_hand` poses all. Float32: 10 um.
     clip = make_clip(4)
-    hand = clip.template
-    if correctives:
-        basis = np.random.default_rng(0).normal(0, 1e-3, (len(hand.vertices), 3, 135))
-        hand = rebuilt(hand, pose_basis=basis)
+    hand = with_correctives(clip.template) if correctives else clip.template
     footage = Footage(WIDTH, HEIGHT, FPS, FOCAL)
     quick = SolveSettings(start_steps=20, landmark_steps=1)
     fitted = fit_landmarks(clip.landmarks, hand, footage, quick)
@@ -212,13 +208,8 @@ def test_outline_vertices_are_those_of_the_hand_model(correctives: bool) -> None
 def test_the_outline_pulls_a_displaced_hand_back() -> None:
     # Landmarks 5 px to the right of the hand; the masks are where the hand is.
     clip = make_clip(6)
-    shifted = Landmarks(
-        clip.landmarks.image + np.array([5.0, 0.0]),
-        clip.landmarks.world,
-        clip.landmarks.score,
-        clip.landmarks.detected,
-    )
-    fitted = fit(clip, shifted)
+    shifted = clip.landmarks.image + np.array([5.0, 0.0])
+    fitted = fit(clip, replace(clip.landmarks, image=shifted))
     windows = follow_hands([clip.landmarks], FPS, 96)
     fields = np.stack(
         [
@@ -234,7 +225,7 @@ def test_the_outline_pulls_a_displaced_hand_back() -> None:
         return float(np.abs((pixels - clip.vertex_pixels).mean(axis=(0, 1)))[0])
 
     before = offset()
-    fit_outline(fitted, contour)
+    refine(fitted, contour)
     assert before > 3.5
     assert offset() < before / 2
 
@@ -246,12 +237,9 @@ FOOTAGE = Footage(WIDTH, HEIGHT, FPS, None)
 def noisy(landmarks: Landmarks) -> Landmarks:
     """Errors of 4 mm and 1.5 px, as a tracker's."""
     random = np.random.default_rng(3)
-    return Landmarks(
-        landmarks.image + random.normal(0, 1.5, landmarks.image.shape),
-        landmarks.world + random.normal(0, 0.004, landmarks.world.shape),
-        landmarks.score,
-        landmarks.detected,
-    )
+    image = landmarks.image + random.normal(0, 1.5, landmarks.image.shape)
+    world = landmarks.world + random.normal(0, 0.004, landmarks.world.shape)
+    return replace(landmarks, image=image, world=world)
 
 
 @pytest.mark.parametrize("side", ["right", "left"])

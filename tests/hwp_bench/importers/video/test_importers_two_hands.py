@@ -17,8 +17,8 @@ from hwp_bench.base.errors import BadCapture, BadInput
 from hwp_bench.capture import identify_hand_model, open_capture
 from hwp_bench.capture.check import check_capture
 from hwp_bench.cli.main import main
-from hwp_bench.hands import pose_hand
 from hwp_bench.hands.raster import overlap
+from hwp_bench.hands.skinning import pose_parameters
 from hwp_bench.importers.shared.landmarks import read_landmarks
 from hwp_bench.importers.video import (
     FrameRange,
@@ -76,12 +76,7 @@ def test_both_hands_lie_on_the_true_ones(imported: ImportedClip, clip: TwoHandCl
     assert imported.shown == "both"
     for side, true in clip.hands.items():
         hand = imported.hands[side]
-        posed = pose_hand(
-            true.template.to_torch(torch.float64),
-            torch.from_numpy(hand.parameters.pose),
-            torch.from_numpy(hand.parameters.betas),
-            torch.from_numpy(hand.parameters.transl),
-        )
+        posed = pose_parameters(true.template, hand.parameters)
         joints = posed.landmarks.numpy()
         middle = np.array([WIDTH / 2, HEIGHT / 2])
         pixels = joints[..., :2] / joints[..., 2:] * FOCAL + middle

@@ -25,8 +25,9 @@ from hwp_bench.base.images import read_rgb, write_image
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.check import check_capture
 from hwp_bench.cli.main import main
-from hwp_bench.hands import load_template, pose_hand, project
+from hwp_bench.hands import load_template, project
 from hwp_bench.hands.raster import overlap
+from hwp_bench.hands.skinning import pose_parameters
 from hwp_bench.importers.video.api import IMPORTER_VERSION, drop_blank_frames, import_video
 from hwp_bench.importers.video.decode import FrameRange, probe, read_frames
 from hwp_bench.importers.video.solve import SolveSettings
@@ -102,13 +103,7 @@ def test_the_capture_is_sound(capture: Capture, clip: SyntheticClip) -> None:
 def test_the_stored_hand_lies_on_the_true_hand(capture: Capture, clip: SyntheticClip) -> None:
     # Through the capture's own cameras, against the truth moved to the crop: 2 px of 128.
     hand = capture.hands["right"]
-    tensors = load_template().to_torch(torch.float64)
-    posed = pose_hand(
-        tensors,
-        torch.from_numpy(hand.pose),
-        torch.from_numpy(hand.betas),
-        torch.from_numpy(hand.transl),
-    )
+    posed = pose_parameters(load_template(), hand)
     cameras = capture.cameras
     pixels, depth = project(
         posed.landmarks, torch.from_numpy(cameras.viewmats), torch.from_numpy(cameras.Ks)

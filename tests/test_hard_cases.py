@@ -1,0 +1,77 @@
+"""The hard cases of scoring, the optimizer, the pre-pass and shadows hold; each can fail.
+
+Oracles and tolerances: the line of each case.
+"""
+
+from __future__ import annotations
+
+import math
+from importlib import import_module
+
+import numpy as np
+import pytest
+import torch
+
+from hwp_bench.stability import Case, CaseGroup, Context, find_cases
+
+PROVIDERS = {
+    "metrics": "hwp_bench.metrics.hard_cases",
+    "optimizer": "wildghand.gaussians.hard_cases",
+    "prepass": "wildghand.prepass.hard_cases",
+    "shadows": "wildghand.light.hard_cases",
+}
+
+
+def group(name: str) -> CaseGroup:
+    return import_module(PROVIDERS[name]).cases
+
+
+def failed(name: str) -> set[str]:
+    """The cases of a group that do not hold, an exception included."""
+    found = set()
+    for case in group(name)():
+        try:
+            passed = case.run(Context()).passed
+        except Exception:
+            passed = False
+        if not passed:
+            found.add(case.name)
+    return found
+
+
+@pytest.mark.parametrize(
+    "case",
+    [case for name in PROVIDERS for case in group(name)()],
+    ids=lambda case: f"{case.group}: {case.name}",
+)
+def test_hard_case_holds(case: Case) -> None:
+    measured = case.run(Context())
+    assert measured.passed, f"{case.must_hold}: {measured.text}"
+
+
+@pytest.mark.parametrize("name", PROVIDERS)
+def test_names_are_unique_and_the_registry_finds_them(name: str) -> None:
+    names = [case.name for case in group(name)()]
+    assert len(names) == len(set(names))
+    found = find_cases([name], [f"{PROVIDERS[name]}:cases"])
+    assert [case.name for case in found] == names
+
+
+def test_cases_notice_what_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as spoilt:
+        spoilt.setattr("hwp_bench.metrics.score.decibels", lambda mse, cap=0.0: 30.0)
+        assert "noise on a mask of a disc" in failed("metrics")
+    with monkeypatch.context() as spoilt:
+        # What Adam did before gradients were looked at.
+        spoilt.setattr("wildghand.gaussians.adam.LARGEST", math.inf)
+        assert {"one gradient of 1e+30, clipped at 0"} <= failed("optimizer")
+    with monkeypatch.context() as spoilt:
+        spoilt.setattr(torch, "_fused_adam_", lambda *given, **more: None)
+        assert "gradients of 1, clipped at 0.5" in failed("optimizer")
+    with monkeypatch.context() as spoilt:
+        spoilt.setattr("wildghand.prepass.judge.LEAST_FRAMES", 1)
+        assert "2 frames" in failed("prepass")
+    with monkeypatch.context() as spoilt:
+        blocked = "hwp_bench.base.rays.EmbreeMesh.blocked"
+        spoilt.setattr(blocked, lambda self, starts, ways: np.zeros(len(starts), dtype=bool))
+        assert "light 30 degrees from straight above a plate" in failed("shadows")
