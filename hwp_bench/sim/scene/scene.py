@@ -303,7 +303,8 @@ def with_clean_share(scene: Scene, share: float) -> Scene:
     )
     # What is left after the last episode of a scene without a clean frame is no stretch.
     lengths = np.where(np.diff(knots) < 1e-5, 0.0, np.diff(knots))
-    wanted = CLEAN_FROM * np.where(acting, 1.0 - share, share)
+    found_clean = bool(lengths[~acting].any())
+    wanted = CLEAN_FROM * np.where(acting, 1.0 - share * found_clean, share)
     totals = np.where(acting, lengths[acting].sum(), lengths[~acting].sum())
     # Without a clean stretch there is nothing to lengthen: the check below says so.
     stretched = np.divide(lengths * wanted, totals, out=np.zeros_like(lengths), where=totals > 0.0)
