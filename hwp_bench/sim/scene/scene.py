@@ -301,7 +301,7 @@ def with_clean_share(scene: Scene, share: float) -> Scene:
             for at in middles
         ]
     )
-    # What is left after the last episode of a scene without a clean frame is no stretch.
+    # A rest after the last episode, in a scene without a clean frame, does not count.
     lengths = np.where(np.diff(knots) < 1e-5, 0.0, np.diff(knots))
     found_clean = bool(lengths[~acting].any())
     wanted = CLEAN_FROM * np.where(acting, 1.0 - share * found_clean, share)
