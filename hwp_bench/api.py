@@ -62,7 +62,7 @@ def evaluate(
 
     Args:
         method: method directory, or the name of one that ships: `plain`, `wildghand`.
-        captures: a suite (`smoke`, `mini`, `full`, `wild-dev`, `wild-test`; rendered on first
+        captures: a suite (`smoke`, `mini`, `full`, `wild-dev`, `persistent`; rendered on first
             use), a capture or its folder, or a list of these.
         out: results folder; `runs/METHOD-SUITE` if None, with the oracle's name, the budget and
             a seed other than 0 behind it.

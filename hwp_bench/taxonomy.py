@@ -145,10 +145,15 @@ def catalogue() -> Mapping[str, CatalogueEntry]:
 
 #: The suites: those of the paper's captures, smallest first (`full-lite` has a twelfth of the
 #: frames of `full`); then scenes as wide as the world,
-#: for tuning (`wild-dev`) and for reports only (`wild-test`).
-SUITES = ("smoke", "mini", "full-lite", "full", "wild-dev", "wild-test")
+#: for tuning (`wild-dev`) and for reports only (`wild-test`); then scenes whose perturbations last,
+#: with 10 % of the training frames clean (`persistent`) and with other shares in percent.
+SUITES = (
+    *("smoke", "mini", "full-lite", "full", "wild-dev", "wild-test", "persistent"),
+    *("persistent-clean0", "persistent-clean20", "persistent-clean35", "persistent-clean60"),
+)
 #: Suites whose captures have the frames and the size of another one: the preset that a method
 #: has for that one fits them too.
 SIZED_LIKE: Mapping[str, str] = MappingProxyType(
-    {"full-lite": "full", "wild-dev": "mini", "wild-test": "mini"}
+    {"full-lite": "full"}
+    | {name: "mini" for name in SUITES if name.startswith(("wild-", "persistent"))}
 )

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 _TABLES = (
     *("overall", "rank", "cost", "captures", "perturbations", "details", "micro", "paper"),
-    *("robustness", "severity", "novelty", "outline", "free-view", "bias", "seeds"),
+    *("robustness", "severity", "clean-share", "novelty", "outline", "free-view", "bias", "seeds"),
 )
 _TABLE = """examples:
   hwp-bench table runs/plain-mini
@@ -38,6 +38,7 @@ _TABLE = """examples:
   hwp-bench table runs/* --by overall --format tex > table.tex
   hwp-bench table runs/mine-mini runs/mine-mini-clean runs/plain-mini --by robustness --base plain
   hwp-bench table runs/mine-seed* --by seeds
+  hwp-bench table runs/mine-persistent* runs/plain-persistent* --by clean-share --figure runs
   hwp-bench table runs/plain-mini runs/mine-mini --by novelty   # where training showed little
   hwp-bench table runs/plain-mini runs/mine-mini --by outline   # what is drawn outside of the hand
   hwp-bench table runs/plain-mini runs/mine-mini --by free-view   # from all around
@@ -63,10 +64,12 @@ def _add_table(parser: argparse.ArgumentParser) -> None:
     )
     add("--published", action="store_true", help=text)
     add("--base", metavar="NAME", help="robustness: method that the gap is counted from")
-    add_capture_folders(parser, "severities, novelty and outlines")
+    add_capture_folders(parser, "severities, clean shares, novelty and outlines")
     forms = ("terminal", "md", "tex", "csv", "json")
     text = "format of the table (default terminal)"
     add("--format", choices=forms, default="terminal", help=text)
+    text = "folder for a figure, of --by clean-share"
+    add("--figure", type=Path, metavar="DIR", help=text)
     add_json(parser, "the same as --format json")
 
 
@@ -77,6 +80,17 @@ def _table(args: argparse.Namespace) -> int:
         args.results, args.by, args.paper, args.published, args.base, args.captures
     )
     _print_table(make_table(request), "json" if args.json else args.format)
+    if args.figure is not None:
+        if args.by != "clean-share":
+            problem = f"there is none of the table {args.by!r}"
+            raise UsageError(problem, field="--figure", remedy="Give --by clean-share.")
+        from hwp_bench.report.clean_share import write_clean_share
+        from hwp_bench.report.sources import find_captures
+        from hwp_bench.results import read_all
+
+        results = read_all([Path(place) for place in args.results])
+        for path in write_clean_share(args.figure, results, find_captures(results, args.captures)):
+            print(path)
     return 0
 
 

@@ -14,13 +14,15 @@ _EXAMPLES = """examples:
   hwp-bench sim render --suite mini
   hwp-bench sim render capture0 -o my_capture --frames 60 --size 160 --severity 3
   hwp-bench sim render all -o captures --subject 7
+  hwp-bench sim render persistent-2 -o none_clean --frames 60 --size 176 --clean-share 0
   hwp-bench sim preview wild-dev-3 -o preview
   hwp-bench sim render --suite full --engine ray://10.0.0.1:6379 --job-cpus 8
   hwp-bench sim preview capture5 -o preview
   hwp-bench sim calibrate my_scene.toml --write
 
-A scene is the name of one of the eleven captures, of a scene of wild-dev or wild-test such as
-wild-dev-3, or the path of a scene file. `all` are the eleven captures, wild-dev all of its own.
+A scene is the name of one of the eleven captures, of a scene of wild-dev, wild-test or persistent
+such as wild-dev-3, or the path of a scene file. `all` are the eleven captures, wild-dev all of its
+own.
 """
 
 
@@ -29,17 +31,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EXAMPLES
     action = add_actions(parser)
     add_json(action("list", "list scenes, suites, objects and effects"))
-    scenes = "scene names, files, all, or a wild suite"
+    scenes = "scene names, files, all, or wild-dev, wild-test, persistent"
 
     plan = action("plan", "print what a scene's frames need and will cost")
     plan.add_argument("scene", metavar="SCENE", nargs="+", help=scenes)
     _add_extent(plan)
+    _add_clean_share(plan)
     text = "count passes only, render no probe for the cost"
     plan.add_argument("--no-probe", action="store_true", help=text)
     add_json(plan)
 
     render = action("render", "render captures")
-    add, text = render.add_argument, "scene name or file, all, or a wild suite"
+    add, text = render.add_argument, "scene name or file, all, or wild-dev, wild-test, persistent"
     add("scene", metavar="SCENE", nargs="?", help=text)
     add("-o", "--out", help="folder to make; for all and for suites their parent")
     add("--suite", choices=SUITES, help="render a suite")
@@ -76,8 +79,14 @@ def _add_extent(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--size", type=int, help="edge of the image in pixels (default 256)")
 
 
+def _add_clean_share(parser: argparse.ArgumentParser) -> None:
+    text = "share of the training part in which no effect acts, 0-0.9: stretches the episodes"
+    parser.add_argument("--clean-share", type=float, metavar="SHARE", help=text)
+
+
 def _add_variation(parser: argparse.ArgumentParser) -> None:
     severity = "one severity, 1-5, for every episode"
+    _add_clean_share(parser)
     parser.add_argument("--severity", type=float, help=severity)
     parser.add_argument("--subject", type=int, metavar="SEED", help="another person")
 

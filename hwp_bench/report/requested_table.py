@@ -11,6 +11,7 @@ from hwp_bench.analysis.pairing import group_runs
 from hwp_bench.base.errors import BadResult, UsageError
 from hwp_bench.base.files import inside, read_json
 from hwp_bench.base.tables import Table
+from hwp_bench.report.clean_share import clean_share_table
 from hwp_bench.report.paper_layouts import (
     DISTANCE,
     LAYOUTS,
@@ -73,7 +74,7 @@ class TableRequest:
 
 
 #: Tables that show each method, settings and seed once.
-_ONCE = ("rank", "cost", "seeds", "robustness", "free-view")
+_ONCE = ("rank", "cost", "seeds", "robustness", "free-view", "clean-share")
 
 
 def make_table(request: TableRequest) -> Table:
@@ -96,6 +97,11 @@ def make_table(request: TableRequest) -> Table:
 
 def _ours(request: TableRequest) -> Table:
     sources = read_sources(request.paths, repeats=request.by not in _ONCE)
+    if request.by == "clean-share":
+        # Captures at several shares are different data, which is what the table is about.
+        results = [source.results for source in sources]
+        table = clean_share_table(results, find_captures(results, request.captures))
+        return add_isolation_note(table, results)
     shown: list[DataGroup] = []
     tables: list[Table] = []
     refused: list[UsageError] = []

@@ -21,6 +21,7 @@ from hwp_bench.sim.scene.scene import (
     Episode,
     Scene,
     clean_share,
+    with_clean_share,
 )
 from hwp_bench.sim.sensor import Sensor
 from hwp_bench.sim.subject.subject import Words
@@ -124,6 +125,13 @@ def parse_scene(text: str, *, where: str) -> Scene:
         if not scene.track.keys.get(side):
             raise BadInput("holds no key", where=where, field=f"track.{side}")
     check_backdrop(scene.background, where)
+    if scene.clean_share is not None:
+        try:
+            scene = with_clean_share(scene, scene.clean_share)
+        except UsageError as error:
+            raise BadInput(
+                error.problem, where=where, field=error.field, remedy=error.remedy
+            ) from error
     _check_effects(scene, where)
     return scene
 
@@ -186,11 +194,11 @@ def _check_effects(scene: Scene, where: str) -> None:
         named = read_effect(call, where).named_hands()
         check_hands(named, scene, f"effects({call.kind})", where)
     share = clean_share(scene)
-    if share < MIN_CLEAN_SHARE:
+    if scene.clean_share is None and share < MIN_CLEAN_SHARE:
         raise BadInput(
             f"only {share:.0%} of the training part is unperturbed, at least "
             f"{MIN_CLEAN_SHARE:.0%} must be",
             where=where,
             field="effects",
-            remedy="Shorten episodes or let those of different effects overlap.",
+            remedy="Shorten episodes, let those of different effects overlap, or say clean_share.",
         )

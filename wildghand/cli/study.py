@@ -142,11 +142,16 @@ def do_explain(args: argparse.Namespace) -> int:
     from hwp_bench.base.images import write_image
     from hwp_bench.capture import open_capture
     from wildghand.avatar.render import explain_frames, explanation_sheet, temporal_weights
+    from wildghand.prepass import frames_text
 
     check_places({"--out": args.out}, {"AVATAR": args.avatar, "CAPTURE": args.capture})
     capture = open_capture(args.capture)
     avatar = avatar_of(args)
     found = explain_frames(avatar, capture, args.frames)
+    record = avatar.record
+    if record.clean and record.frame_weights:
+        floor = avatar.settings.prepass.weight_floor
+        print(frames_text(record.clean, record.frame_weights, floor))
     for side, (size, rank) in temporal_weights(avatar, capture).items():
         told = "not known" if rank is None else f"{rank:.2f}"
         print(f"{side} hand: mean |omega| {size:.2g}, rank correlation with severity {told}")

@@ -19,7 +19,8 @@ from wildghand.gaussians.training import FrameTable, TrainingFrames, upload
 from wildghand.model.frames import RenderedFrames
 from wildghand.pao.sam import PromptedHand, mask_of, open_sam
 from wildghand.pao.segmenters import RegionCache, graph_cut_hands
-from wildghand.prepass import FrameAssessment, PrepassInput, judge_frames
+from wildghand.prepass import FrameAssessment, PrepassInput, frames_text, judge_frames
+from wildghand.prepass.assessment import CLEAN_SHARE
 
 #: How far inside the posed hand's outline a pixel must lie to count as hidden, as a share of the
 #: image's height: closer to it a mask leaves a pixel out because the given pose is not exact.
@@ -55,6 +56,9 @@ class Prepass(Component):
             given(data.frames), settings, None if judges is None else given(judges)
         )
         self.assessment = found
+        if found.clean_share < CLEAN_SHARE:
+            weights = (found.clean.tolist(), found.frame_weights.tolist())
+            fit.tell(frames_text(*weights, settings.weight_floor))
         self._refine_pose = torch.from_numpy(found.refine_pose)
         data.judgement = Judgement(
             torch.from_numpy(found.clean).float(),

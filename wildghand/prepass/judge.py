@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from hwp_bench.hands.anchors import HandSurfaces
 from wildghand.prepass.assessment import (
     CLEAN_FROM,
     CLEAN_SHARE,
+    LEAST_CLEAN,
     FrameAssessment,
     PrepassSettings,
     densest,
@@ -58,8 +60,16 @@ LEAST_FRAMES = 4
 # the residual, loss of texture, change of the log of the border's width, hidden share of the hand.
 # They are what clean frames of simulated captures show, so that a clip without perturbations has
 # no outliers.
-_GAIN_FLOOR, _RESIDUAL_FLOOR, _TEXTURE_FLOOR = 0.08, 0.25, 0.15
-_BORDER_FLOOR, _HIDDEN_FLOOR = 0.15, 0.02
+_GAIN_FLOOR = 0.08
+_FLOORS: Mapping[str, float] = MappingProxyType(
+    {
+        "level": 0.25,
+        "texture": 0.15,
+        "border": 0.15,
+        "misplacement": PrepassSettings.misplacement_floor,
+        "hidden": 0.02,
+    }
+)
 # Deviation from which a cue by itself calls a frame blurred or misplaced.
 _CLEAR = 3.0
 # Deviation at which a cue starts to count; it grows like a logarithm beyond.
@@ -74,8 +84,14 @@ def classify_frames(
     measured: Mapping[int, FrameMeasurements],
     settings: PrepassSettings,
     tolerance: float,
+    known: Sequence[FrameMeasurements] = (),
 ) -> FrameAssessment:
-    """Compare (R,) frames of ascending numbers and assess them; every pixel has full weight."""
+    """Compare (R,) frames of ascending numbers and assess them; every pixel has full weight.
+
+    They are compared with each other, unless few are clean: then with frames that are `known` to be
+    so, and weights are relative. The best `CLEAN_SHARE` of the frames counts as clean ones do
+    elsewhere, so that a clip without a clean frame is learnt from the least perturbed ones.
+    """
     count = len(indices)
     rows = np.array(sorted(measured))
     usable = np.zeros(count, dtype=bool)
@@ -87,9 +103,14 @@ def classify_frames(
         return result
 
     found = [measured[row] for row in rows.tolist()]
-    gains, off = _compare(found)
+    gains, off = _compare_with(found, known) if known else _compare(found)
     against = evidence([*off.values()], indices[rows], settings.tolerance)
     clean = spread(clean_probability(against, tolerance))
+    best = clean
+    if known:
+        least = max(tolerance, float(np.quantile(against, CLEAN_SHARE)))
+        best = spread(clean_probability(against, least))
+    certain = clean if (clean >= CLEAN_FROM).sum() >= LEAST_CLEAN else best
     border, texture = _gathered(found, "border"), _gathered(found, "texture")
     sharp_border = float(np.exp(normal_value(np.log(border), CLEAN_SHARE)[0]))
     extent = np.sqrt(np.maximum(np.nan_to_num(border) ** 2 - sharp_border**2, 0.0))
@@ -98,8 +119,9 @@ def classify_frames(
         indices=indices,
         usable=usable,
         clean=clean,
-        frame_weights=settings.weight_floor + (1.0 - settings.weight_floor) * clean,
-        omega_dropout=np.where(clean >= CLEAN_FROM, 1.0, 0.0),
+        frame_weights=settings.weight_floor + (1.0 - settings.weight_floor) * best,
+        omega_dropout=np.where(certain >= CLEAN_FROM, 1.0, 0.0),
+        clean_share=float((clean >= CLEAN_FROM).mean()),
         refine_pose=spread(refine.astype(np.float64)) > 0.5,
         log_gains=spread(gains),
         gain_deviation=spread(off["gain"]),
@@ -115,6 +137,24 @@ def classify_frames(
         motion=spread(_gathered(found, "motion")),
         pixel_weights=np.full((count, *size), 255, dtype=np.uint8),
     )
+
+
+def clean_share(
+    found: Sequence[FrameMeasurements],
+    known: Sequence[FrameMeasurements],
+    indices: np.ndarray,
+    tolerance: float,
+) -> float:
+    """Share of frames that are like those which are known to be clean; 1 if these are too few.
+
+    Args:
+        indices: (R,) ascending numbers of the frames.
+        tolerance: evidence at which a frame is as likely clean as not.
+    """
+    if len(known) < LEAST_FRAMES:
+        return 1.0
+    off = _compare_with(found, known)[1]
+    return float((evidence([*off.values()], indices, tolerance) < tolerance).mean())
 
 
 def clip_tolerance(found: np.ndarray, least: float) -> float:
@@ -146,17 +186,42 @@ def _compare(found: Sequence[FrameMeasurements]) -> tuple[np.ndarray, dict[str, 
     """
     gains = _gathered(found, "gain")
     gains = gains - densest(gains, CLEAN_SHARE)[0]
-    cues = {
-        "gain": (np.linalg.norm(gains, axis=1), _GAIN_FLOOR),
-        "level": (np.log(np.maximum(_gathered(found, "level"), 1e-4)), _RESIDUAL_FLOOR),
-        "texture": (-_gathered(found, "texture"), _TEXTURE_FLOOR),
-        "border": (np.log(_gathered(found, "border")), _BORDER_FLOOR),
-        "misplacement": (_gathered(found, "misplacement"), PrepassSettings.misplacement_floor),
-        "hidden": (_gathered(found, "hidden"), _HIDDEN_FLOOR),
-    }
-    return gains, {
-        name: excess(values, CLEAN_SHARE, floor) for name, (values, floor) in cues.items()
-    }
+    off = {"gain": excess(np.linalg.norm(gains, axis=1), CLEAN_SHARE, _GAIN_FLOOR)}
+    for (name, floor), values in zip(_FLOORS.items(), _cues(found), strict=True):
+        off[name] = excess(values, CLEAN_SHARE, floor)
+    return gains, off
+
+
+def _cues(found: Sequence[FrameMeasurements]) -> list[np.ndarray]:
+    """The cues of `_FLOORS`, (R,) each, the larger the worse."""
+    return [
+        np.log(np.maximum(_gathered(found, "level"), 1e-4)),
+        -_gathered(found, "texture"),
+        np.log(_gathered(found, "border")),
+        _gathered(found, "misplacement"),
+        _gathered(found, "hidden"),
+    ]
+
+
+def _compare_with(
+    found: Sequence[FrameMeasurements], known: Sequence[FrameMeasurements]
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Compare R frames with frames that are known to be clean.
+
+    A frame is off by how far a cue lies beyond those of all known frames, in the least deviations
+    that count as one: a few frames do not tell how widely clean ones spread.
+
+    Returns:
+        What `_compare` returns; gains are relative to the median of the known frames'.
+    """
+    gains, clean = _gathered(found, "gain"), _gathered(known, "gain")
+    apart = np.linalg.norm(gains[:, None] - clean[None], axis=2).min(axis=1)
+    off = {"gain": apart / _GAIN_FLOOR}
+    for name, values, ordinary in zip(_FLOORS, _cues(found), _cues(known), strict=True):
+        highest = np.max(ordinary, where=np.isfinite(ordinary), initial=-np.inf)
+        beyond = np.maximum(values - highest, 0.0) / _FLOORS[name]
+        off[name] = np.where(np.isfinite(beyond), beyond, 0.0)
+    return gains - np.median(clean, axis=0), off
 
 
 def evidence(deviations: Sequence[np.ndarray], indices: np.ndarray, tolerance: float) -> np.ndarray:
@@ -230,15 +295,18 @@ def _judge(
     shown = shown_cells(frames.values(), len(cell_normals))
     model = fit_intensity(samples, cell_normals)
     measured = {row: measure_frame(model, frame, shown) for row, frame in frames.items()}
-    tolerance = settings.tolerance
+    tolerance, compared = settings.tolerance, list[FrameMeasurements]()
     if known_clean is not None:
         known = _readable(_draw(known_clean, surfaces))
         found = [measure_frame(model, frame, shown) for frame in known.values()]
-        indices = np.concatenate([given.indices[usable], known_clean.indices[[*known]]])
-        off = _compare([*measured.values(), *found])[1]
-        against = evidence([*off.values()], indices, tolerance)
-        tolerance = clip_tolerance(against[len(measured) :], tolerance)
-    judged = classify_frames(given.indices, given.size, measured, settings, tolerance)
+        if clean_share([*measured.values()], found, given.indices[usable], tolerance) < CLEAN_SHARE:
+            compared = found
+        else:
+            indices = np.concatenate([given.indices[usable], known_clean.indices[[*known]]])
+            off = _compare([*measured.values(), *found])[1]
+            against = evidence([*off.values()], indices, tolerance)
+            tolerance = clip_tolerance(against[len(measured) :], tolerance)
+    judged = classify_frames(given.indices, given.size, measured, settings, tolerance, compared)
     # Pixels are compared with what clean frames show, which is known only now.
     verdict = Verdict(judged.clean[usable], model.gains)
     model = fit_intensity(samples, cell_normals, verdict)

@@ -52,8 +52,15 @@ from hwp_bench.sim.produce.free_view import (
 )
 from hwp_bench.sim.produce.truth import distances, write_truth
 from hwp_bench.sim.render.frame import eight_bit_coverage, render_frame, write_layers
-from hwp_bench.sim.scene.scene import Scene, intrinsics, parameters_of, scene_hands, viewmat
-from hwp_bench.sim.scene_files import load_scene, scene_groups, scene_names
+from hwp_bench.sim.scene.scene import (
+    Scene,
+    intrinsics,
+    parameters_of,
+    scene_hands,
+    viewmat,
+    with_clean_share,
+)
+from hwp_bench.sim.scene_files import load_scene, scene_names
 from hwp_bench.sim.sensor import check_encoder, through_h264
 from hwp_bench.sim.subject.hand import of_side, skin_atlas
 
@@ -485,6 +492,7 @@ def _info(scene: Scene, plans: list[FramePlan], size: int) -> CaptureInfo:
             "scene_digest": scene.digest,
             "seed": scene.seed,
             "renderer": RENDERER,
+            **({} if scene.clean_share is None else {"clean_share": scene.clean_share}),
         },
         licence=LICENCE,
     )
@@ -515,10 +523,14 @@ class _Rule:
     size: int
     #: Frames of each capture, over the same motions; None: by the paper's number and `every`.
     frames: int | None = None
-    #: The captures; None: all of the group of scenes with the suite's name, or the eleven.
+    #: The captures; None: all scenes of the group.
     captures: tuple[str, ...] | None = None
     #: Without `frames`: how many of the paper's frames stand for one of the suite's.
     every: int = 1
+    #: The group of scenes; empty: the eleven captures.
+    group: str = ""
+    #: Share of the training part that is clean; None: as the scenes have it.
+    clean_share: float | None = None
 
 
 _SUITES: Mapping[str, _Rule] = MappingProxyType(
@@ -527,14 +539,21 @@ _SUITES: Mapping[str, _Rule] = MappingProxyType(
         "mini": _Rule(176, 60, _MINI),
         "full-lite": _Rule(256, every=12),
         "full": _Rule(256),
-        "wild-dev": _Rule(176, 60),
-        "wild-test": _Rule(176, 60),
+        "wild-dev": _Rule(176, 60, group="wild-dev"),
+        "wild-test": _Rule(176, 60, group="wild-test"),
+        "persistent": _Rule(176, 60, group="persistent"),
+        **{
+            f"persistent-clean{percent}": _Rule(
+                176, 60, group="persistent", clean_share=percent / 100
+            )
+            for percent in (0, 20, 35, 60)
+        },
     }
 )
 
 
 def suite_names() -> tuple[str, ...]:
-    """Names of the suites: those of the paper's captures, smallest first, then the wild ones."""
+    """Names of the suites: the paper's captures, smallest first, wild ones, persistent ones."""
     return tuple(_SUITES)
 
 
@@ -544,7 +563,9 @@ def suite(name: str) -> tuple[SuiteItem, ...]:
     Args:
         name: `smoke` (seconds), `mini` (minutes), `full` (hours), `full-lite` (a twelfth
             of its frames), or of scenes that are as wide as the world: `wild-dev` (for tuning)
-            or `wild-test` (for reports only).
+            or `wild-test` (for reports only); or of perturbations that last: `persistent`, with
+            10 % of the training frames clean, and `persistent-clean0`, `-clean20`, `-clean35` and
+            `-clean60`, the same captures with another share.
 
     Raises:
         UsageError: there is no such suite.
@@ -552,8 +573,9 @@ def suite(name: str) -> tuple[SuiteItem, ...]:
     if name not in _SUITES:
         raise UsageError(f"there is no suite {name!r}", remedy=f"Known: {', '.join(_SUITES)}.")
     rule = _SUITES[name]
-    group = name if name in scene_groups() else ""
-    scenes = [load_scene(capture) for capture in rule.captures or scene_names(group)]
+    scenes = [load_scene(capture) for capture in rule.captures or scene_names(rule.group)]
+    if rule.clean_share is not None:
+        scenes = [with_clean_share(scene, rule.clean_share) for scene in scenes]
     return tuple(
         SuiteItem(scene, rule.frames or -(-scene.frame_count // rule.every), rule.size)
         for scene in scenes

@@ -67,7 +67,7 @@ def print_plan(args: argparse.Namespace) -> int:
     from hwp_bench.sim.produce.forecast import forecast, plan_table, share_table
     from hwp_bench.sim.produce.truth import distances, subject_table
 
-    scenes = _scenes(args.scene)
+    scenes = [_changed(scene, args.clean_share) for scene in _scenes(args.scene)]
     reports = [forecast(scene, args.frames, args.size, probe=not args.no_probe) for scene in scenes]
     off = {scene.id: hands for scene in scenes if (hands := distances(scene))}
     if args.json:
@@ -90,7 +90,10 @@ def render(args: argparse.Namespace) -> int:
 
     if (args.suite is None) == (args.scene is None):
         raise UsageError("give a scene, all, or a suite with --suite")
-    changes = (args.frames, args.size, args.severity, args.subject, args.seed)
+    changes = (
+        *(args.frames, args.size, args.severity, args.subject, args.seed),
+        args.clean_share,
+    )
     if args.suite is not None:
         if any(change is not None for change in changes) or args.exr:
             raise UsageError("a suite is rendered as it is", field="--suite")
@@ -111,7 +114,10 @@ def render(args: argparse.Namespace) -> int:
         raise UsageError("is missing", field="-o", remedy="Give a folder with -o.")
     if args.seed is not None and args.seed < 0:
         raise UsageError(f"is {args.seed}", field="--seed", remedy="Use 0 or more.")
-    scenes = [_changed(scene, args.severity, args.subject) for scene in _scenes([args.scene])]
+    scenes = [
+        _changed(scene, args.clean_share, args.severity, args.subject)
+        for scene in _scenes([args.scene])
+    ]
     named = Path(args.scene)
     check_places(
         {"--out": args.out},
@@ -146,7 +152,7 @@ def render(args: argparse.Namespace) -> int:
 def preview(args: argparse.Namespace) -> int:
     """Write a contact sheet and an animation, or the stage in 3D."""
     check_places({"--out": args.out}, {})
-    scene = _changed(load_scene(args.scene), args.severity, args.subject)
+    scene = _changed(load_scene(args.scene), args.clean_share, args.severity, args.subject)
     if args.stage:
         from hwp_bench.sim.produce.preview import draw_stage
 
@@ -187,9 +193,16 @@ def _scenes(names: list[str]) -> list[Scene]:
     return [load_scene(name) for name in meant_scenes(names)]
 
 
-def _changed(scene: Scene, severity: float | None, subject: int | None) -> Scene:
-    from hwp_bench.sim.scene.scene import with_severity, with_subject
+def _changed(
+    scene: Scene,
+    share: float | None,
+    severity: float | None = None,
+    subject: int | None = None,
+) -> Scene:
+    from hwp_bench.sim.scene.scene import with_clean_share, with_severity, with_subject
 
+    if share is not None:
+        scene = with_clean_share(scene, share)
     if severity is not None:
         scene = with_severity(scene, severity)
     if subject is not None:

@@ -15,7 +15,7 @@ from hwp_bench.sim.geometry.surface import RenderCost
 from hwp_bench.sim.produce.capture import check_extent
 from hwp_bench.sim.produce.free_view import FRAMES, free_views, render_free
 from hwp_bench.sim.render.frame import carry_out, steady_gain
-from hwp_bench.sim.scene.scene import Scene
+from hwp_bench.sim.scene.scene import CLEAN_FROM, Scene, clean_share, moments
 from hwp_bench.sim.sensor import through_h264
 
 # Joins the names of effects that act in the same frame.
@@ -44,6 +44,10 @@ class Forecast:
     seconds: Mapping[str, float] | None
     #: Rays by group, or None without probing.
     rays: Mapping[str, int] | None
+    #: Share of the training part in which no effect acts, 0 to 1, by the scene's episodes.
+    clean_share: float
+    #: Training frames in which no effect acts.
+    clean_frames: int
     #: Frames of the free-view clip.
     free_frames: int = FRAMES
     #: Processor seconds of that clip, or None without probing.
@@ -100,6 +104,11 @@ def forecast(
         groups={name: len(items) for name, items in groups.items()},
         seconds=seconds,
         rays=rays,
+        clean_share=round(clean_share(scene), 4),
+        clean_frames=sum(
+            not item.strength and moment < CLEAN_FROM
+            for item, moment in zip(plans, moments(count).tolist(), strict=True)
+        ),
         free_seconds=free_seconds,
         free_rays=free_rays,
     )
@@ -175,6 +184,8 @@ def plan_table(forecasts: list[Forecast]) -> Table:
             else:
                 spent = seconds[name]
                 rows.append((item.scene, name, count, spent / count, spent, rays[name] / 1e6))
+        clean = f"clean in training ({item.clean_share:.0%} of it)"
+        rows.append((item.scene, clean, item.clean_frames, None, None, None))
         passes = ", ".join(f"{name} {count}" for name, count in item.passes.items())
         spent_free, cast = item.free_seconds, item.free_rays
         each = None if spent_free is None else spent_free / item.free_frames

@@ -394,6 +394,62 @@ def _notebook(variant: int) -> Surface:
     return join([box((0.088, 0.138, 0.011), pages), *covers])
 
 
+_APPLES = ((0.72, 0.10, 0.10), (0.46, 0.62, 0.16))
+_LIDS = ((0.70, 0.16, 0.14), (0.16, 0.30, 0.52))
+_CASES = ((0.90, 0.52, 0.08), (0.14, 0.16, 0.18))
+
+
+def _apple(variant: int) -> Surface:
+    """An apple of 7.5 cm, its stalk along z."""
+    import cv2
+
+    rng = generator(24, "apple", variant)
+    image = canvas(128, 256, _APPLES[variant % len(_APPLES)])
+    for _ in range(160):
+        place = (int(rng.integers(0, 256)), int(rng.integers(8, 120)))
+        cv2.ellipse(image, place, (1, int(rng.integers(2, 12))), 0, 0, 360, ink((0.85, 0.66, 0.3)))
+    angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 33)
+    # A dent at either end.
+    dent = 0.06 * np.maximum(np.abs(np.sin(angle)) - 0.9, 0.0) * np.sign(np.sin(angle))
+    profile = np.stack([0.0375 * np.cos(angle) ** 0.8, 0.035 * np.sin(angle) - dent], axis=1)
+    profile[[0, -1], 0] = 0.0
+    stalk = np.stack([np.zeros(7), 0.002 * np.linspace(0, 1, 7) ** 2, np.linspace(0.025, 0.042, 7)])
+    brown = coat((0.25, 0.16, 0.08), gloss=0.7)
+    skin = turned(profile, picture_material(image, 0.25), 40)
+    return join([skin, tube(stalk.T, np.full(7, 0.0018), brown)])
+
+
+def _jar(variant: int) -> Surface:
+    """A jar of 11 cm along z with a paper label, its lid at +z."""
+    import cv2
+
+    lid = coat(_LIDS[variant % len(_LIDS)], gloss=0.3)
+    label = canvas(128, 256, (0.45, 0.24, 0.14))
+    label[30:104] = ink((0.92, 0.90, 0.82))
+    cv2.putText(label, "plum", (18, 80), cv2.FONT_HERSHEY_DUPLEX, 1.5, ink((0.3, 0.12, 0.3)), 3)
+    cv2.putText(label, "1,2 kg", (146, 76), cv2.FONT_HERSHEY_DUPLEX, 0.9, ink((0.2, 0.2, 0.2)), 2)
+    glass = picture_material(label[::-1], 0.12)
+    hull = [(0.0, -0.055), (0.034, -0.055), (0.037, -0.05), (0.037, 0.03), (0.032, 0.04)]
+    top = [(0.034, 0.036), (0.034, 0.054), (0.032, 0.056), (0.0, 0.056)]
+    return join([turned(hull, glass, 40), turned(top, lid, 40)])
+
+
+def _torch(variant: int) -> Surface:
+    """A torch of 15 cm along z, its lamp at +z."""
+    case = coat(_CASES[variant % len(_CASES)], gloss=0.35)
+    rubber = plain((0.03, 0.03, 0.03), gloss=0.8)
+    lens = plain((0.75, 0.78, 0.8), gloss=0.05, specular=0.4)
+    grip = [(0.0, -0.075), (0.015, -0.075), (0.017, -0.07), (0.017, 0.02)]
+    head = [(0.017, 0.02), (0.027, 0.04), (0.029, 0.07), (0.026, 0.073)]
+    front = [(0.026, 0.073), (0.025, 0.069), (0.0, 0.069)]
+    button = shift(box((0.009, 0.005, 0.018), rubber), (0.0, 0.0175, 0.0))
+    rings = [
+        turned([(0.0172, z), (0.0185, z + 0.003), (0.0172, z + 0.006)], rubber)
+        for z in (-0.06, -0.045, -0.03)
+    ]
+    return join([turned(grip, case), turned(head, case), turned(front, lens), button, *rings])
+
+
 # What builds each object; the variant chooses among its colours, sizes and pictures.
 _BUILDERS: Mapping[str, Callable[[int], Surface]] = MappingProxyType(
     {
@@ -413,6 +469,9 @@ _BUILDERS: Mapping[str, Callable[[int], Surface]] = MappingProxyType(
         "bottle": _bottle,
         "brush": _brush,
         "notebook": _notebook,
+        "apple": _apple,
+        "jar": _jar,
+        "torch": _torch,
     }
 )
 

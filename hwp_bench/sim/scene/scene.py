@@ -34,8 +34,10 @@ SCHEMA = "hwp-scene/1"
 RAMP = 0.2
 #: Where the clean part of a capture begins, as a fraction: nothing is perturbed from here on.
 CLEAN_FROM = 0.8
-#: Share of the training frames that must stay unperturbed.
+#: Share of the training part that must stay unperturbed where a scene does not say `clean_share`.
 MIN_CLEAN_SHARE = 0.35
+#: Most of the training part that `clean_share` leaves unperturbed.
+MAX_CLEAN_SHARE = 0.9
 
 _Metres = Annotated[float, Meta(ge=-1.0, le=1.0)]
 
@@ -119,6 +121,11 @@ class Episode:
     #: Severity in its middle, 1-5; it rises and falls at the ends.
     severity: float
 
+    @property
+    def span(self) -> tuple[float, float]:
+        """First and last moment."""
+        return self.start, self.end
+
     def rise(self, moment: float) -> float | None:
         """How far a moment lies inside of the nearer end, in lengths of `RAMP`; None outside."""
         if not self.start <= moment <= self.end:
@@ -179,6 +186,10 @@ class Scene:
     estimator: Estimator | None = None
     #: What moves behind the hands.
     behind: Behind = NOTHING
+    #: Share of the training part in which no effect acts, 0 to 0.9: episodes are stretched or
+    #: shortened until it is so (`with_clean_share`). None: they are as written, and at least 35 %
+    #: must be clean.
+    clean_share: Annotated[float, Meta(ge=0.0, le=MAX_CLEAN_SHARE)] | None = None
 
     @property
     def sides(self) -> tuple[str, ...]:
@@ -214,6 +225,8 @@ class Scene:
             del content["estimator"]
         if self.behind == NOTHING:
             del content["behind"]
+        if self.clean_share is None:
+            del content["clean_share"]
         if self.sensor == Sensor(self.sensor.noise):
             content["noise"] = content.pop("sensor")["noise"]
         return content
@@ -259,6 +272,64 @@ def with_subject(scene: Scene, seed: int) -> Scene:
 def with_effects(scene: Scene, kinds: Collection[str]) -> Scene:
     """The scene with only some of its effects."""
     return replace(scene, effects=tuple(call for call in scene.effects if call.kind in kinds))
+
+
+# How far the share may be off that was asked for: ends of mild episodes round to severity 0.
+_SHARE_SLACK = 0.01
+
+
+def with_clean_share(scene: Scene, share: float) -> Scene:
+    """The scene with another share of its training part unperturbed.
+
+    Time is stretched piecewise: every stretch without an effect by one factor, every other one by
+    another, so that episodes keep their order, their overlaps and their severities.
+
+    Args:
+        share: 0 (an effect acts in every training frame) to `MAX_CLEAN_SHARE`.
+
+    Raises:
+        UsageError: the share is out of range, or the episodes cannot be brought to it.
+    """
+    if not 0.0 <= share <= MAX_CLEAN_SHARE:
+        raise UsageError(f"{share} is not in 0..{MAX_CLEAN_SHARE}", field="clean_share")
+    ends = sorted({end for call in scene.effects for part in call.episodes for end in part.span})
+    knots = np.unique([0.0, *ends, CLEAN_FROM])
+    middles = 0.5 * (knots[1:] + knots[:-1])
+    acting = np.array(
+        [
+            any(part.start < at < part.end for call in scene.effects for part in call.episodes)
+            for at in middles
+        ]
+    )
+    # A rest after the last episode, in a scene without a clean frame, does not count.
+    lengths = np.where(np.diff(knots) < 1e-5, 0.0, np.diff(knots))
+    found_clean = bool(lengths[~acting].any())
+    wanted = CLEAN_FROM * np.where(acting, 1.0 - share * found_clean, share)
+    totals = np.where(acting, lengths[acting].sum(), lengths[~acting].sum())
+    # Without a clean stretch there is nothing to lengthen: the check below says so.
+    stretched = np.divide(lengths * wanted, totals, out=np.zeros_like(lengths), where=totals > 0.0)
+    # An episode acts in its last moment too, and the first one of the clean part is not its.
+    places = np.minimum(np.round(np.cumsum([0.0, *stretched]), 9), CLEAN_FROM - 1e-6)
+    moved = dict(zip(knots.tolist(), places.tolist(), strict=True))
+    effects = tuple(
+        replace(
+            call,
+            episodes=tuple(
+                replace(part, start=moved[part.start], end=moved[part.end])
+                for part in call.episodes
+            ),
+        )
+        for call in scene.effects
+    )
+    found = replace(scene, effects=effects, clean_share=share)
+    if abs(clean_share(found) - share) > _SHARE_SLACK:
+        raise UsageError(
+            f"the episodes leave {clean_share(found):.0%} of the training part unperturbed "
+            f"instead of {share:.0%}",
+            field="clean_share",
+            remedy="Give the scene episodes of a severity from 1.5 on, with gaps between them.",
+        )
+    return found
 
 
 #: A level below this rounds to severity 0: the effect is absent.

@@ -106,7 +106,8 @@ def test_lists_speak_json(capsys) -> None:
     assert main(["list", "--json"]) == 0
     value = json.loads(capsys.readouterr().out)
     assert [row["capture"] for row in value["captures"]] == [f"capture{i}" for i in range(11)]
-    suites = ["smoke", "mini", "full-lite", "full", "wild-dev", "wild-test"]
+    suites = ["smoke", "mini", "full-lite", "full", "wild-dev", "wild-test", "persistent"]
+    suites += [f"persistent-clean{percent}" for percent in (0, 20, 35, 60)]
     assert [row["suite"] for row in value["suites"]] == suites
     assert "plain" in [row["method"] for row in value["methods"]]
 

@@ -88,8 +88,8 @@ def only(given: PrepassInput, frames: np.ndarray) -> PrepassInput:
 def check_ranges(judgement: FrameAssessment, count: int) -> None:
     """Every field is finite and in its range."""
     for field in fields(FrameAssessment):
-        values = getattr(judgement, field.name)
-        assert len(values) == count, field.name
+        values = np.asarray(getattr(judgement, field.name))
+        assert values.ndim == 0 or len(values) == count, field.name
         assert np.isfinite(values.astype(np.float64)).all(), field.name
     assert ((judgement.clean >= 0) & (judgement.clean <= 1)).all()
     assert ((judgement.frame_weights >= 0.2) & (judgement.frame_weights <= 1)).all()

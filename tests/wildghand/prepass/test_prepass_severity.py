@@ -6,6 +6,7 @@ import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,11 +25,8 @@ def test_every_perturbation_has_a_cue() -> None:
 def test_levels_grow_with_their_cue_and_with_no_other(kind: str) -> None:
     neutral = neutral_assessment(np.arange(4), np.array([True, True, True, False]), (8, 8))
     cue, deviations = CUES[kind]
-    judgement = dataclasses.replace(
-        neutral,
-        clean=np.array([0.9, 0.1, 0.1, 0.0]),
-        **{cue: deviations * np.array([4.0, 2.0, 40.0, 3.0])},
-    )
+    changed: dict[str, Any] = {cue: deviations * np.array([4.0, 2.0, 40.0, 3.0])}
+    judgement = dataclasses.replace(neutral, clean=np.array([0.9, 0.1, 0.1, 0.0]), **changed)
     levels = estimated_severity(judgement)
     # Clean, two levels, more than the most, not usable.
     assert levels.pop(kind).tolist() == [0, 2, 5, 0]

@@ -27,7 +27,9 @@ def test_every_object_is_sound_and_of_a_size_for_hands(name: str, variant: int) 
     assert not surface.hand.any()
 
 
-@pytest.mark.parametrize("name", ["mug", "ball", "spoon", "banana", "remote", "bottle", "brush"])
+@pytest.mark.parametrize(
+    "name", ["mug", "ball", "spoon", "banana", "remote", "bottle", "brush", "apple", "jar", "torch"]
+)
 def test_faces_look_outward(name: str) -> None:
     surface = build_object(name)
     corners = surface.vertices[surface.faces]

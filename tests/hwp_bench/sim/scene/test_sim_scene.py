@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -11,7 +12,7 @@ from tiny_scene import SINGLE
 
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.capture.splits import contiguous_split
-from hwp_bench.sim.produce.capture import suite, suite_names
+from hwp_bench.sim.produce.capture import SuiteItem, suite, suite_names
 from hwp_bench.sim.scene.scene import (
     CLEAN_FROM,
     MIN_CLEAN_SHARE,
@@ -20,6 +21,7 @@ from hwp_bench.sim.scene.scene import (
     level,
     moments,
     severity,
+    with_clean_share,
     with_effects,
     with_severity,
     with_subject,
@@ -52,14 +54,100 @@ def test_scene_says_what_the_catalogue_says(name: str) -> None:
     assert clean_share(scene) >= MIN_CLEAN_SHARE
 
 
-@pytest.mark.parametrize("name", suite_names())
+def clean_frames(item: SuiteItem, frames: np.ndarray) -> int:
+    """How many of some frames nothing perturbs."""
+    when = moments(item.frame_count)[frames]
+    return sum(not any(level(call, moment) for call in item.scene.effects) for moment in when)
+
+
+@pytest.mark.parametrize("name", [name for name in suite_names() if "persistent" not in name])
 def test_enough_training_frames_of_every_suite_are_clean(name: str) -> None:
     # Frames are few in small suites, so that a share of the time is not yet one of the frames.
     for item in suite(name):
+        train = contiguous_split(item.scene.id, item.frame_count).train
+        clean = clean_frames(item, train)
+        assert clean >= MIN_CLEAN_SHARE * len(train), (item.scene.id, clean, len(train))
+
+
+@pytest.mark.parametrize(
+    ("name", "share", "clean"),
+    [
+        ("persistent", 0.1, 5),
+        ("persistent-clean0", 0.0, 0),
+        ("persistent-clean20", 0.2, 10),
+        ("persistent-clean35", 0.35, 17),
+        ("persistent-clean60", 0.6, 29),
+    ],
+)
+def test_a_persistent_suite_has_its_share_of_clean_frames(
+    name: str, share: float, clean: int
+) -> None:
+    # Oracle: so many of 48 training frames, to the nearest frame; validation and test are clean.
+    items = suite(name)
+    assert [item.scene.id for item in items] == [f"persistent-{number}" for number in range(8)]
+    for item in items:
         split = contiguous_split(item.scene.id, item.frame_count)
-        when = moments(item.frame_count)[split.train]
-        clean = [not any(level(call, moment) for call in item.scene.effects) for moment in when]
-        assert sum(clean) >= MIN_CLEAN_SHARE * len(clean), (item.scene.id, sum(clean), len(clean))
+        assert item.scene.clean_share == share
+        assert len(split.train) == 48
+        assert clean_frames(item, split.train) == clean == round(48 * share)
+        later = np.concatenate([split.validation, split.test])
+        assert clean_frames(item, later) == len(later)
+
+
+def test_another_clean_share_stretches_every_gap_alike(make_scene: SceneMaker) -> None:
+    # Oracle: 0.35 of 0.8 is perturbed, in episodes of 0.15, 0.1 and 0.1 with gaps of 0.05, 0.1,
+    # 0.1 and 0.2; the factors are those of the two sums.
+    scene = make_scene()
+    changed = with_clean_share(scene, 0.1)
+    episodes = [part for call in changed.effects for part in call.episodes]
+    starts, ends = [part.start for part in episodes], [part.end for part in episodes]
+    busy, idle = 0.72 / 0.35, 0.08 / 0.45
+    assert ends == pytest.approx(
+        [0.05 * idle + 0.15 * busy, 0.15 * idle + 0.25 * busy, 0.25 * idle + 0.35 * busy], abs=1e-6
+    )
+    assert starts == pytest.approx(
+        [0.05 * idle, 0.15 * idle + 0.15 * busy, 0.25 * idle + 0.25 * busy], abs=1e-6
+    )
+    assert [part.severity for part in episodes] == [4, 3, 3]
+    assert clean_share(changed) == pytest.approx(0.1, abs=0.01)
+    # At its own share a scene stays what it is, but for the field.
+    again = with_clean_share(changed, 0.1)
+    assert [call.episodes[0].start for call in again.effects] == pytest.approx(starts, abs=1e-6)
+    assert scene.digest != changed.digest
+    assert "clean_share" not in scene.to_json()
+    assert changed.to_json()["clean_share"] == 0.1
+
+
+@pytest.mark.parametrize("share", [-0.1, 0.95, float("nan")])
+def test_a_clean_share_out_of_range_is_refused(make_scene: SceneMaker, share: float) -> None:
+    with pytest.raises(UsageError, match=r"clean_share: .* is not in 0\.\.0\.9"):
+        with_clean_share(make_scene(), share)
+
+
+def test_a_clean_share_that_episodes_cannot_have_is_refused(make_scene: SceneMaker) -> None:
+    # No effect, none that always acts, and one whose ends are too mild to count as perturbed.
+    with pytest.raises(UsageError, match="leave 100% of the training part unperturbed"):
+        with_clean_share(with_effects(make_scene(), ()), 0.1)
+    always = with_clean_share(make_scene(), 0.0)
+    assert clean_share(always) == pytest.approx(0.0, abs=1e-3)
+    with pytest.raises(UsageError, match="leave 0% of the training part unperturbed instead of 3"):
+        with_clean_share(always, 0.3)
+    with pytest.raises(UsageError, match=r"severity from 1\.5 on"):
+        with_clean_share(with_severity(make_scene(), 1), 0.1)
+
+
+def test_a_scene_file_says_its_clean_share(make_scene: SceneMaker) -> None:
+    text = ("seed = 5", "seed = 5\nclean_share = 0.2")
+    assert make_scene(text) == with_clean_share(make_scene(), 0.2)
+    # Fewer clean frames than other scenes must have are refused without the field.
+    longer = ("[[0.5, 0.6, 3]]", "[[0.41, 0.79, 3]]")
+    with pytest.raises(BadInput, match="at least 35% must be"):
+        make_scene(longer)
+    assert clean_share(make_scene(text, longer)) == pytest.approx(0.2, abs=0.01)
+    with pytest.raises(BadInput, match=r"tiny\.toml: clean_share"):
+        make_scene(("seed = 5", "seed = 5\nclean_share = 1.0"))
+    with pytest.raises(BadInput, match=r"tiny\.toml: clean_share: the episodes leave"):
+        make_scene(text, ("episodes = [[0.05, 0.2, 4]]", "episodes = [[0.05, 0.2, 1]]"))
 
 
 @pytest.mark.parametrize("name", sorted(catalogue()))
@@ -161,7 +249,7 @@ def test_unknown_scene_lists_the_known_ones() -> None:
 
 
 def test_groups_of_scenes_are_apart_from_the_eleven() -> None:
-    assert scene_groups() == ("wild-dev", "wild-test")
+    assert scene_groups() == ("persistent", "wild-dev", "wild-test")
     assert not set(scene_names()) & {name for group in scene_groups() for name in known(group)}
     assert meant_scenes(["all"]) == scene_names()
     assert meant_scenes(["wild-dev", "a.toml"]) == (*known("wild-dev"), "a.toml")

@@ -1,0 +1,91 @@
+"""Scores over the share of clean training frames. Oracle: by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from hwp_bench.base.errors import UsageError
+from hwp_bench.cli.main import main
+from hwp_bench.report.clean_share import (
+    clean_share_of,
+    clean_share_table,
+    draw_clean_share,
+    scores_by_share,
+    write_clean_share,
+)
+from hwp_bench.results import Results, write_results
+
+
+@pytest.fixture
+def study(make_results, make_capture) -> tuple[list[Results], dict]:
+    """Two methods on captures at two shares; each result has frames of `psnr` and one more."""
+    info = make_capture("capture2").info
+    results, captures = [], {}
+    for suite, share, scores in (("few", 0.1, (20, 23)), ("many", 0.6, (26, 27))):
+        digest = f"{int(100 * share):064x}"
+        captures[digest] = replace(info, source={"kind": "simulated", "clean_share": share})
+        for name, psnr in zip(("plain", "mine"), scores, strict=True):
+            made = make_results(name, psnr)
+            scored = [replace(made.captures[0], digest=digest)]
+            results.append(replace(made, suite=suite, captures=scored))
+    return results, captures
+
+
+def test_a_method_is_one_curve_over_its_suites(study) -> None:
+    results, captures = study
+    found = scores_by_share(results, captures, "psnr")
+    assert [(one.share, one.score.value) for one in found] == [
+        (0.1, pytest.approx(20.5)),
+        (0.1, pytest.approx(23.5)),
+        (0.6, pytest.approx(26.5)),
+        (0.6, pytest.approx(27.5)),
+    ]
+    labels = [one.label for one in found]
+    assert labels[:2] == labels[2:]
+    assert labels[0] != labels[1]
+    assert [one.behind and one.behind.value for one in found] == [
+        None,
+        pytest.approx(3.0),
+        None,
+        pytest.approx(1.0),
+    ]
+    # A difference that is the same in every frame has no spread, the score has one.
+    assert found[1].behind is not None
+    assert (found[1].behind.low, found[1].behind.high) in {(None, None), (3.0, 3.0)}
+    shown = [(row[0], row[8], row[9]) for row in clean_share_table(results, captures).rows]
+    assert shown == [(10, 1, 1), (10, 1, 1), (60, 1, 1), (60, 1, 1)]
+
+
+def test_a_share_is_said_or_counted(make_capture) -> None:
+    # Of 20 frames 16 are trained on, of which frames 1, 5, 9 and 13 are blurred.
+    info = make_capture("capture2").info
+    assert clean_share_of(info) == pytest.approx(12 / 16)
+    assert clean_share_of(replace(info, source={"clean_share": 0.2})) == 0.2
+    assert clean_share_of(replace(info, perturbations={"motion_blur": None})) is None
+    assert clean_share_of(replace(info, perturbations={})) == 1.0
+
+
+def test_unknown_shares_are_refused(study) -> None:
+    with pytest.raises(UsageError, match="share of clean training frames of none"):
+        scores_by_share(study[0], {}, "psnr")
+
+
+def test_the_command_prints_it_and_the_figure_has_every_method(study, tmp_path, capsys) -> None:
+    results, captures = study
+    for number, result in enumerate(results):
+        write_results(tmp_path / str(number) / "results.json", result)
+    # Captures that are nowhere on this machine.
+    folders = [str(tmp_path / str(number)) for number in range(4)]
+    assert main(["table", *folders, "--by", "clean-share"]) == 2
+    assert "render the suite" in capsys.readouterr().err
+    figure = draw_clean_share(scores_by_share(results, captures, "psnr"), "psnr")
+    written = write_clean_share(tmp_path, results, captures)
+    assert [path.suffix for path in written] == [".png", ".svg"]
+    (axes,) = figure.axes
+    curves = [
+        line for line in axes.lines if len(line.get_xdata()) == 2 and line.get_marker() != "o"
+    ]
+    assert [list(line.get_ydata()) for line in curves] == [[20.5, 26.5], [23.5, 27.5]]
+    assert [tick.get_text() for tick in axes.get_xticklabels()] == ["10 %", "60 %"]
