@@ -293,7 +293,8 @@ def _gain_error(found: FrameAssessment, gains: np.ndarray) -> float:
 
 def _sound(found: FrameAssessment, count: int = _FRAMES) -> bool:
     """Whether every number is finite and in its range."""
-    arrays = [getattr(found, item.name) for item in fields(found)]
+    values = [getattr(found, item.name) for item in fields(found)]
+    arrays = [one for one in values if isinstance(one, np.ndarray)]
     finite = all(len(one) == count and np.isfinite(one.astype(float)).all() for one in arrays)
     floor = PrepassSettings.weight_floor
     shares = (found.clean, found.omega_dropout, (found.frame_weights - floor) / (1.0 - floor))

@@ -178,6 +178,8 @@ class Installation:
             [sys.executable, "-c", _PROGRAM],
             env={
                 **os.environ,
+                # Python's own code files know a source by its second and size alone.
+                "PYTHONDONTWRITEBYTECODE": "1",
                 "PYTHONPATH": str(self.folder),
                 "HWP_CACHE": str(self.cache),
                 **environment,
