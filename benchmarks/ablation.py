@@ -45,6 +45,8 @@ from hwp_bench.evaluation.ablate.effects import (
 from hwp_bench.evaluation.ablate.runs import AblationRuns, Design, make_design, result_folder
 from hwp_bench.methods.manifest import find_method, read_manifest
 from hwp_bench.report.figures import write_cost
+from hwp_bench.report.sources import find_captures, read_sources
+from hwp_bench.report.study_tables import bias_table
 from hwp_bench.report.tables import HEADLINE
 from hwp_bench.results import Results
 from hwp_bench.results.store import read_unchanged
@@ -317,8 +319,21 @@ def _shown(folder: Path, part: Part, pictures: Path, root: Path) -> dict[str, An
             if name in tables
         ],
         "each": _markdown(capture_gains(ablation)),
+        "bias": _bias(folder, part),
         "picture": _picture(folder, part, pictures, root),
     }
+
+
+def _bias(folder: Path, part: Part) -> str | None:
+    """The paper's Table 9 of the variant with all components, first seed; None without weights."""
+    assert part.ablation is not None
+    seed = min(part.ablation.any_run.seeds)
+    place = folder / part.suite / part.name / result_folder(list(part.ablation.runs)[-1], seed)
+    sources = read_sources([place])
+    try:
+        return _markdown(bias_table(sources, find_captures([one.results for one in sources])))
+    except UsageError:
+        return None
 
 
 def _picture(folder: Path, part: Part, pictures: Path, root: Path) -> str | None:

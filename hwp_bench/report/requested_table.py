@@ -179,7 +179,7 @@ def _bias_layout(sources: Sequence[ResultsSource], request: TableRequest) -> Tab
         or (request.published and name in METRIC_OF.values())
     )
     captures = find_captures([source.results for source in sources], request.captures)
-    rows = bias_rows(sources, captures, names)
+    rows = [row[:-1] for row in bias_rows(sources, captures, names)]
     if sources and not rows:
         raise refused_bias()
     return bias_layout(rows, names, [LEVEL_NOTE] if rows else [], request.published)

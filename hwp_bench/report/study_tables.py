@@ -16,7 +16,12 @@ from hwp_bench.base.tables import Cell, Column, Table
 from hwp_bench.capture.schema import CaptureInfo
 from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.metrics.score import aggregate
-from hwp_bench.report.sources import ResultsSource, mean_severity, mean_temporal_weight
+from hwp_bench.report.sources import (
+    ResultsSource,
+    mean_severity,
+    mean_temporal_weight,
+    rank_with_severity,
+)
 from hwp_bench.report.tables import HEADLINE, labels
 from hwp_bench.results import Results
 from hwp_bench.results.schema import score_rows
@@ -238,7 +243,7 @@ def severity_table(sources: Sequence[ResultsSource], captures: Mapping[str, Capt
 def bias_rows(
     sources: Sequence[ResultsSource], captures: Mapping[str, CaptureInfo], metrics: Sequence[str]
 ) -> list[tuple[Cell, ...]]:
-    """Return the rows of the bias table: capture, level, severity, method, scores, mean weight.
+    """Return rows: capture, level, severity, method, scores, mean weight, and its correlation.
 
     Captures are ordered by their severity, unknown ones last.
     """
@@ -255,7 +260,9 @@ def bias_rows(
             known = mean_severity(info, test) if info else {}
             severity = max(known.values(), default=None)
             scores = [means[capture.id].get(name) for name in metrics]
-            rows.append((capture.id, _level(severity), severity, title, *scores, 1000 * weight))
+            rank = rank_with_severity(source, capture.id, info)
+            row = (capture.id, _level(severity), severity, title, *scores, 1000 * weight, rank)
+            rows.append(row)
     return sorted(rows, key=lambda row: (row[2] is None, row[2] or 0.0, row[0]))
 
 
@@ -273,13 +280,20 @@ def bias_table(sources: Sequence[ResultsSource], captures: Mapping[str, CaptureI
     columns = [Column("Capture"), Column("Disturbance"), Column("Severity", 2), Column("Method")]
     columns += [score_column(name) for name in names]
     columns.append(Column("Mean temporal weight [1e-3]", 3))
-    return Table("Bias strength", tuple(columns), tuple(rows), (LEVEL_NOTE,), ranked=False)
+    columns.append(Column("Rank correlation", 2))
+    return Table(
+        "Bias strength", tuple(columns), tuple(rows), (LEVEL_NOTE, RANK_NOTE), ranked=False
+    )
 
 
 #: The levels of the bias table.
 LEVEL_NOTE = (
     "Severity: the strongest perturbation's mean over the frames to learn from, 0 to 5; low is "
     "below 1, medium below 2. Weights: mean over sides and training frames."
+)
+#: What the last column of the bias table is.
+RANK_NOTE = (
+    "Rank correlation: Spearman's, of the weights of frames with the sum of their severities."
 )
 
 

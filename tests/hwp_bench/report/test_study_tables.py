@@ -92,6 +92,11 @@ def test_bias_is_the_mean_weight(on_disk) -> None:
     row = cells(make_table(TableRequest([source.folder], by="bias", captures=[capture.root])))[0]
     assert row["Mean temporal weight [1e-3]"] == pytest.approx(2.0)
     assert row["Disturbance"] == "Low"
+    # Of the two frames the second alone is perturbed, and has the larger weight.
+    assert row["Rank correlation"] == pytest.approx(1.0)
+    write_json(folder / "temporal.json", {"frames": [0, 1], "weights": [0.5, 0.5]})
+    row = cells(make_table(TableRequest([source.folder], by="bias", captures=[capture.root])))[0]
+    assert row["Rank correlation"] is None
     table = make_table(TableRequest([source.folder], paper=9, published=True))
     assert len(table.rows) == 4
     assert "published" in table.rows[-1][0]
