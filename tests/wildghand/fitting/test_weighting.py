@@ -137,7 +137,6 @@ def test_validation_frames_are_known_to_be_clean(
     for fit, known in ((believing, given(judges)), (alone, None)):
         expected = judge_frames(given(fit.data.frames), believing.settings.prepass, known)
         np.testing.assert_array_equal(fit.data.judgement.clean, np.float32(expected.clean))
-    assert (believing.data.judgement.clean >= alone.data.judgement.clean).all()
     assert not torch.equal(believing.data.judgement.clean, alone.data.judgement.clean)
     # They teach nothing: a fit has the rows of its training frames alone.
     assert believing.data.frames.indices.tolist() == alone.data.frames.indices.tolist()
