@@ -117,8 +117,8 @@ class CaptureResult:
     exact_masks: bool
     #: Digest of everything that decides the scores; equal keys need no second run.
     key: Line
-    #: Every frame that the split lists, in order.
-    frames: Annotated[list[FrameResult], Meta(max_length=MAX_FRAMES)]
+    #: Every frame that the split lists, in order; at least one.
+    frames: Annotated[list[FrameResult], Meta(min_length=1, max_length=MAX_FRAMES)]
     #: Why the method failed on the whole capture, or None.
     failure: Message | None
     #: SHA-256 over the decoded pixels of the predictions, in frame order.
@@ -314,8 +314,8 @@ def differing_settings(results: Sequence[Results]) -> list[str]:
         ]
         names = sorted({name for table in twins for name in table})
         different = [name for name in names if len({table.get(name) for table in twins}) > 1]
-        values = {name: f"= {value[:_SHOWN]}" for name, value in mine.items()}
-        told.append(", ".join(f"{name} {values.get(name, 'default')}" for name in different))
+        own = [f"{name} = {mine[name][:_SHOWN]}" for name in different if name in mine]
+        told.append(", ".join(own) if own or not different else "default settings")
     return told
 
 
