@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -140,6 +140,25 @@ class CaptureInfo:
             name: None if values is None else values[frame]
             for name, values in self.perturbations.items()
         }
+
+    def rank_with_severity(self, frames: Sequence[int], weights: Sequence[float]) -> float | None:
+        """Return Spearman's correlation of weights with the severity of their frames.
+
+        Severity is the sum of the levels of all perturbations of a frame. None where there is no
+        such frame, a level is not known, or all frames have the same severity or weight.
+        """
+        if max(frames, default=0) >= self.frame_count:
+            return None
+        levels = [[*self.severity(frame).values()] for frame in frames]
+        if any(level is None for each in levels for level in each):
+            return None
+        severity = [sum(level or 0 for level in each) for each in levels]
+        if len(set(severity)) < 2 or len(set(weights)) < 2:
+            return None
+        # Imported here: it takes half a second, which every command and fit would wait for.
+        from scipy.stats import spearmanr
+
+        return float(spearmanr(weights, severity).statistic)
 
     def to_json(self) -> dict[str, Any]:
         """Return the JSON object that `from_json` reads."""

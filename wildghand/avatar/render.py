@@ -151,22 +151,14 @@ def temporal_weights(
 ) -> dict[str, tuple[float, float | None]]:
     """The mean size of omega by hand, and its rank correlation with the frames' severity.
 
-    Severity is the sum of the levels of all perturbations. The correlation (Spearman's) is None
-    where a level is not known, or where all frames have the same severity or weight.
+    See `CaptureInfo.rank_with_severity`.
     """
-    # Imported here: it takes half a second, which every command and fit would wait for.
-    from scipy.stats import spearmanr
-
     frames, found = avatar.record.frames, {}
-    levels = [[*capture.info.severity(frame).values()] for frame in frames]
-    known = all(level is not None for each in levels for level in each)
-    severity = [sum(level or 0 for level in each) for each in levels]
     for side in avatar.model.perturbation:
         temporal = avatar.model.biases_of(side).temporal(torch.arange(len(frames)))
-        sizes, rank = temporal.omega.abs().numpy(), None
-        if known and len(set(severity)) > 1 and len(set(sizes.tolist())) > 1:
-            rank = float(spearmanr(sizes, severity).statistic)
-        found[side] = float(sizes.mean()), rank
+        sizes = temporal.omega.abs()
+        rank = capture.info.rank_with_severity(frames, sizes.tolist())
+        found[side] = float(sizes.numpy().mean()), rank
     return found
 
 
