@@ -21,9 +21,8 @@ from types import MappingProxyType
 
 import numpy as np
 
-from hwp_bench.base.arrays import read_npz
 from hwp_bench.base.console import progress
-from hwp_bench.base.errors import BadInput, HwpError, UsageError, place, reason_of, whole_number
+from hwp_bench.base.errors import HwpError, UsageError, place, reason_of, whole_number
 from hwp_bench.base.files import atomic_write, cache_root, canonical_json, sha256_json
 from hwp_bench.base.folders import exclusive
 from hwp_bench.capture import (
@@ -45,8 +44,9 @@ from hwp_bench.sim.produce.estimates import confused_mask, estimate_hands, estim
 from hwp_bench.sim.produce.free_view import FRAMES as FREE_FRAMES
 from hwp_bench.sim.produce.free_view import (
     add_free_view,
+    free_file,
     has_free_view,
-    read_waiting_free,
+    read_waiting,
     render_waiting_free,
     write_free_view,
 )
@@ -264,9 +264,10 @@ def _render(request: RenderRequest, out: Path, on_progress: OnProgress) -> None:
 
 def _render_missing(request: RenderRequest, waiting: Path, on_progress: OnProgress) -> None:
     scene = request.scene
-    missing = [frame for frame in range(request.frames) if _read_frame(waiting, frame) is None]
+    frames = range(request.frames)
+    missing = [frame for frame in frames if read_waiting(frame_file(waiting, frame)) is None]
     free = range(FREE_FRAMES if request.free_view else 0)
-    unseen = [frame for frame in free if read_waiting_free(waiting, frame) is None]
+    unseen = [frame for frame in free if read_waiting(free_file(waiting, frame)) is None]
     left = len(missing) + len(unseen)
     if not left:
         return
@@ -349,14 +350,6 @@ def render_waiting(request: RenderRequest, frame: int, folder: Path) -> None:
         write_layers(path.with_suffix(".exr"), request.scene, result, count, size)
     # Last: the frame counts as rendered only when all of it is there.
     atomic_write(path, buffer.getvalue())
-
-
-def _read_frame(folder: Path, frame: int) -> dict[str, np.ndarray] | None:
-    """Read a rendered frame; None if it is missing or damaged."""
-    try:
-        return read_npz(frame_file(folder, frame))
-    except BadInput:
-        return None
 
 
 def _render_in_processes(
@@ -453,7 +446,7 @@ def _video(scene: Scene, waiting: Path, info: CaptureInfo, name: str) -> Iterato
 
 
 def _waiting_frame(waiting: Path, frame: int) -> dict[str, np.ndarray]:
-    arrays = _read_frame(waiting, frame)
+    arrays = read_waiting(frame_file(waiting, frame))
     if arrays is None:
         frame_file(waiting, frame).unlink(missing_ok=True)
         raise HwpError(

@@ -272,10 +272,10 @@ def render_waiting_free(
         yield frame
 
 
-def read_waiting_free(folder: Path, frame: int) -> dict[str, np.ndarray] | None:
-    """Read a frame of the clip that waits; None if it is missing or damaged."""
+def read_waiting(path: Path) -> dict[str, np.ndarray] | None:
+    """Read a rendered frame that waits, of capture or clip; None if it is missing or damaged."""
     try:
-        return read_npz(free_file(folder, frame))
+        return read_npz(path)
     except BadInput:
         return None
 
@@ -308,7 +308,7 @@ def write_free_view(
     views, size, cost = free_views(scene), info.width, RenderCost()
     pictures = []
     for frame, item in enumerate(views):
-        arrays = read_waiting_free(waiting, frame)
+        arrays = read_waiting(free_file(waiting, frame))
         if arrays is None:
             problem = f"frame {frame} of the free view was lost before the capture was whole"
             raise HwpError(problem, where=waiting, remedy="Start again: what is there is kept.")
