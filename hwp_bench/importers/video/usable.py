@@ -40,9 +40,9 @@ _BRIGHT, _BRIGHT_SHARE = 245.0, 0.3
 _DARK, _DARK_SHARE = 20.0, 0.7
 # Least Cr of YCrCb in the fingers: less is grey, green or blue.
 _SKIN = 130.0
-# Difference of a bone's colours from those beside it, in Lab of 8 bits, that is drawn and no
-# finger's shading; and how far beside it, as a share of the hand's size.
-_DRAWN, _BESIDE = 30.0, 0.025
+# Difference of a bone's colours from those next to it, in Lab of 8 bits, that is drawn and no
+# finger's shading; and how far from it, as a share of the hand's size.
+_DRAWN, _SHIFT = 30.0, 0.025
 # Places along a bone.
 _ALONG = np.linspace(0.2, 0.8, 7)[:, None, None]
 _BONES = np.array(LANDMARK_EDGES)
@@ -54,7 +54,7 @@ _COUNT, _COLUMNS = 12, 4
 
 @dataclass(frozen=True)
 class Fault:
-    """What is wrong with a video."""
+    """A reason against a video."""
 
     #: With numbers, of a hand.
     said: str
@@ -66,7 +66,7 @@ class Fault:
 
 @dataclass(frozen=True, eq=False)
 class Quality:
-    """What a hand's frames are like; (F,) each, NaN where it is not detected or looked at."""
+    """Measurements of a hand in frames; (F,) each, NaN where it is not detected or looked at."""
 
     #: Larger side of the landmarks' box, px of the video.
     size: np.ndarray
@@ -77,9 +77,9 @@ class Quality:
     #: Share of the hand that is white, and that is black.
     bright: np.ndarray
     dark: np.ndarray
-    #: Median Cr of YCrCb beside the bones.
+    #: Median Cr of YCrCb next to the bones.
     redness: np.ndarray
-    #: Median difference of the bones' colours from those beside them, Lab.
+    #: Median difference of the bones' colours from those next to them, Lab.
     drawn: np.ndarray
 
     def faults(self, frame: int) -> list[str]:
@@ -98,7 +98,8 @@ def measure(source: VideoSource, landmarks: Landmarks) -> Quality:
     """Measure the frames of one hand."""
     points, seen, info = landmarks.image, landmarks.detected, source.video
     size = np.ptp(points, axis=1).max(axis=1)
-    outside = ((points < 0) | (points > (info.width, info.height))).any(axis=-1)[:, 1:].sum(axis=1)
+    beyond = (points[:, 1:] < 0) | (points[:, 1:] > (info.width, info.height))
+    outside = np.count_nonzero(np.any(beyond, axis=-1), axis=1)
     palm = points[:, list(PALM)].mean(axis=1)
     # Seen edge on, a palm is narrow.
     width = np.percentile(np.linalg.norm(points[seen, 5] - points[seen, 17], axis=-1), 90)
@@ -127,12 +128,12 @@ def _look(image: np.ndarray, points: np.ndarray) -> tuple[float, float, float, f
     along = (first * (1.0 - _ALONG) + last * _ALONG).reshape(-1, 2)
     way = (last - first)[:, ::-1] * (-1.0, 1.0)
     way = way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-6)
-    beside = _BESIDE * float(np.ptp(points, axis=0).max()) * np.tile(way, (len(_ALONG), 1))
+    shift = _SHIFT * float(np.ptp(points, axis=0).max()) * np.tile(way, (len(_ALONG), 1))
     rows, columns, inside = map(
         np.array,
-        zip(*(cells(along + side, image.shape) for side in (0.0, beside, -beside)), strict=True),
+        zip(*(cells(along + by, image.shape) for by in (0.0, shift, -shift)), strict=True),
     )
-    inside = inside.all(axis=0)
+    inside = np.asarray(inside.all(axis=0))
     if not inside.any() or not hand.any():
         return (np.nan,) * 4
     colors = image[rows[:, inside], columns[:, inside]]
