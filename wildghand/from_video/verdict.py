@@ -51,7 +51,7 @@ PARTS = {
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a fit is worth."""
+    """The worth of a fit."""
 
     #: Share of the surface that frames have shown, by side.
     surface_seen: dict[str, float]
@@ -148,7 +148,8 @@ def _score(avatar: WildGHandAvatar, capture: Capture) -> tuple[float | None, int
     """PSNR over test frames where the fit has not seen them, else over fitted ones."""
     test = contiguous_split(capture.info.id, len(capture)).test
     test = test[np.all([capture.hands[side].valid[test] for side in avatar.sides], axis=0)]
-    kept_out = len(test) > 0 and not set(test.tolist()) & set(avatar.record.frames)
+    # A fit of every frame leaves the last two as well.
+    kept_out = len(test) > 2 and not set(test.tolist()) & set(avatar.record.frames)
     frames = np.array(test if kept_out else avatar.record.frames)
     found = []
     for frame in frames[evenly(len(frames), _SCORED)].tolist():
