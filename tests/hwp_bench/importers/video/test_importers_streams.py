@@ -57,7 +57,7 @@ def cut(path: Path, share: float = 0.6) -> Path:
 @pytest.mark.parametrize(
     ("codec", "ending"),
     [("libsvtav1", "mp4"), ("libsvtav1", "mkv"), ("libx265", "mov"), ("libvpx-vp9", "webm"),
-     ("prores_ks", "mov"), ("ffv1", "mkv")],
+     ("libvpx", "webm"), ("prores_ks", "mov"), ("ffv1", "mkv")],
 )  # fmt: skip
 def test_codecs_of_phones_and_browsers(tmp_path: Path, codec: str, ending: str) -> None:
     options = {"libsvtav1": {"preset": "11", "svtav1-params": "lp=1"},
