@@ -118,8 +118,9 @@ def judge_avatar(avatar: WildGHandAvatar, capture: Capture) -> Verdict:
         named = "" if len(avatar.sides) == 1 else f" of the {side} hand"
         for name, share in sorted(parts[side].items(), key=lambda item: item[1]):
             if share < _ENOUGH:
-                said = "was never seen" if share < _NEVER else f"was seen by {share:.0%}"
-                film.append(f"the {name}{named} {said}: {PARTS[name]}")
+                some = "" if share < _NEVER else f"only {share:.0%} of "
+                seldom = "was seen" if some else "was never seen"
+                film.append(f"{some}the {name}{named} {seldom}: {PARTS[name]}")
         fit = hands.get(side, {})
         if "reprojection_px" in fit:
             errors[side] = float(fit["reprojection_px"]["mean"])
