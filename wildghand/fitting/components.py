@@ -9,7 +9,7 @@ from wildghand.fitting.choice import Averaging, StateChoice, ValidationFrames
 from wildghand.fitting.colors import StartColors
 from wildghand.fitting.disentangle import Dpd, GeometryDropout
 from wildghand.fitting.fit import Component, Fit
-from wildghand.fitting.judging import Background, HandMasks, HiddenSkin, Prepass
+from wildghand.fitting.judging import HandMasks, HiddenSkin, Prepass
 from wildghand.fitting.light import Lighting
 from wildghand.fitting.objective import Reconstruction, Regularisers
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
@@ -42,7 +42,6 @@ def components_of(settings: WildGHandSettings) -> list[Component]:
         (settings.terms.leave_hidden, HiddenSkin),
         (True, Reconstruction),
         (True, Pao if by_regions else MaskWeights),
-        (settings.terms.background > 0.0, Background),
         (True, Regularisers),
         (settings.dpd.enabled, Dpd),
         (settings.schedule.geometry_dropout > 0.0, GeometryDropout),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import cv2
@@ -16,7 +16,6 @@ from hwp_bench.methods.settings import source_path
 from wildghand.fitting.data import FitData, Judgement
 from wildghand.fitting.fit import Component, DrawOptions, Fit, FrameTarget, StepBatch
 from wildghand.gaussians.training import FrameTable, TrainingFrames, upload
-from wildghand.model import terms
 from wildghand.model.frames import RenderedFrames
 from wildghand.pao.sam import PromptedHand, mask_of, open_sam
 from wildghand.pao.segmenters import RegionCache, graph_cut_hands
@@ -94,7 +93,14 @@ class HiddenSkin(Component):
 
     def before(self, fit: Fit) -> None:
         """Find these pixels."""
-        self._hidden = _pixel_table(fit, hidden_skin)
+        frames = fit.data.frames
+        hidden = torch.from_numpy(hidden_skin(fit.data.places, frames.masks.numpy()))
+        self._hidden = FrameTable(
+            lambda rows: upload(hidden[rows], fit.device),
+            len(frames),
+            frames.masks[0].numel(),
+            fit.device,
+        )
 
     def compare(
         self, fit: Fit, batch: StepBatch, drawing: RenderedFrames, target: FrameTarget
@@ -105,60 +111,6 @@ class HiddenSkin(Component):
             self._hidden(batch.mine)[..., None], drawing.image.detach(), target.image
         )
         return replace(target, image=image)
-
-
-class Background(Component):
-    """Nothing is drawn where a frame shows that there is no hand.
-
-    The reconstruction counts little outside of the mask, as something may cover the hand there, and
-    over black it does not see what is dark.
-    """
-
-    def before(self, fit: Fit) -> None:
-        """Find these pixels."""
-        self._clear = _pixel_table(fit, clear_background)
-
-    def loss(
-        self, fit: Fit, batch: StepBatch, drawing: RenderedFrames, target: FrameTarget
-    ) -> Iterable[torch.Tensor]:
-        """The coverage of these pixels."""
-        clear = self._clear(batch.mine)
-        yield fit.settings.terms.background * terms.coverage_within(drawing.coverage, clear)
-
-
-def _pixel_table(
-    fit: Fit, find: Callable[[Sequence[np.ndarray], np.ndarray], np.ndarray]
-) -> FrameTable:
-    """(H, W) bool of each frame, found from the places of the posed hands and the masks."""
-    frames = fit.data.frames
-    found = torch.from_numpy(find(fit.data.places, frames.masks.numpy()))
-    return FrameTable(
-        lambda rows: upload(found[rows], fit.device), len(frames), found[0].numel(), fit.device
-    )
-
-
-def clear_background(places: Sequence[np.ndarray], masks: np.ndarray) -> np.ndarray:
-    """Find the pixels that lie off the masks and off the posed hands.
-
-    Args:
-        places: R times (H, W), 0 where the posed hands are not (`skin_places`).
-        masks: (R, H, W) uint8, 255 = visible hand.
-
-    Returns:
-        (R, H, W) bool.
-    """
-    square = _square(masks.shape[1])
-    clear = np.empty(masks.shape, dtype=bool)
-    for row, (place, mask) in enumerate(zip(places, masks, strict=True)):
-        hand = ((place > 0) | (mask > 0)).astype(np.uint8)
-        clear[row] = cv2.dilate(hand, square) == 0
-    return clear
-
-
-def _square(height: int) -> np.ndarray:
-    """The pixels within `MARGIN` of one."""
-    margin = max(1, round(MARGIN * height))
-    return np.ones((2 * margin + 1, 2 * margin + 1), dtype=np.uint8)
 
 
 def hidden_skin(places: Sequence[np.ndarray], masks: np.ndarray) -> np.ndarray:
@@ -174,7 +126,8 @@ def hidden_skin(places: Sequence[np.ndarray], masks: np.ndarray) -> np.ndarray:
     Returns:
         (R, H, W) bool.
     """
-    square = _square(masks.shape[1])
+    margin = max(1, round(MARGIN * masks.shape[1]))
+    square = np.ones((2 * margin + 1, 2 * margin + 1), dtype=np.uint8)
     hidden = np.empty(masks.shape, dtype=bool)
     for row, (place, mask) in enumerate(zip(places, masks, strict=True)):
         inside = cv2.erode((place > 0).astype(np.uint8), square)

@@ -144,7 +144,7 @@ _BARE: Mapping[str, Any] = MappingProxyType(
     {
         "start_colors": False,
         "schedule": {"validated": False},
-        "terms": {"surface": 0.0, "background": 0.0, "leave_hidden": False},
+        "terms": {"surface": 0.0, "leave_hidden": False},
         **{
             name: {"enabled": False}
             for name in ("poses", "subject", "light", "shadows", "visibility", "prepass")

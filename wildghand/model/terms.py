@@ -105,8 +105,6 @@ class TermSettings:
     leave_hidden: bool = True
     #: `off_surface`: what keeps Gaussians from being opaque discs that lie on the skin.
     surface: float = number(5e-4, 0.0, 1e6)
-    #: `coverage_within`: what is drawn where neither mask nor posed hand is.
-    background: float = number(0.3, 0.0, 1e6)
     #: A perceptual distance (`wildghand.gaussians.perceptual`).
     perceptual: float = number(0.0, 0.0, 1e6)
 
@@ -181,16 +179,6 @@ def silhouette(coverage: Tensor, hand: Tensor) -> Tensor:
             f"has shape {tuple(hand.shape)}, the coverage {tuple(coverage.shape)}", field="hand"
         )
     return (coverage - hand.to(coverage)).square().mean()
-
-
-def coverage_within(coverage: Tensor, area: Tensor) -> Tensor:
-    """Mean over all pixels of the coverage in some of them.
-
-    Args:
-        coverage: (B, H, W, 1) alpha of the rendering.
-        area: (B, H, W) bool.
-    """
-    return (coverage[..., 0] * area).mean()
 
 
 def gain_of_clean(log_gains: Tensor, clean: Tensor) -> Tensor:
