@@ -403,6 +403,41 @@ def _publish(args: argparse.Namespace) -> int:
     return print_result(args.json, value, lines)
 
 
+_SECOND_VIEW = """examples:
+  hwp-bench data second-view front side --calibration cameras.toml     # captures of two videos
+  hwp-bench data second-view cam400015 cam400016                       # of a data set
+
+What the second camera saw at the same time becomes the free-view clip of CAPTURE, whose scores are
+apart. docs/video.md describes the calibration file.
+"""
+
+
+def _add_second_view(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = _SECOND_VIEW
+    add = parser.add_argument
+    add("capture", type=Path, metavar="CAPTURE", help="capture folder, which gets the clip")
+    add("second", type=Path, metavar="SECOND", help="capture of the second camera")
+    text = "where both cameras are; needed for videos"
+    add("--calibration", type=Path, metavar="TOML", help=text)
+    add("--force", action="store_true", help="replace an existing clip")
+    add_json(parser, "print the numbers as JSON")
+
+
+def _second_view(args: argparse.Namespace) -> int:
+    from hwp_bench.capture import open_capture
+    from hwp_bench.importers.second_view import add_second_view, read_calibration
+
+    calibration = None if args.calibration is None else read_calibration(args.calibration)
+    captures = open_capture(args.capture), open_capture(args.second)
+    made = add_second_view(*captures, calibration, overwrite=args.force)
+    place = args.capture / "free"
+    lines = [f"free-view clip: {place}, {len(made.frames)} frames"]
+    if made.scale is not None:
+        lines.append(f"scale: a metre of the capture is {made.scale:.3f} m")
+    lines.append(f"landmarks: {made.distance_px:.2f} px from where the second camera saw them")
+    return print_result(args.json, {"clip": str(place), **asdict(made)}, lines)
+
+
 _CONVERT = """examples:
   hwp-bench hands convert my_capture as_mano --hand-model mano:mano_v1_2/models
   hwp-bench hands convert mano_capture as_free --hand-model anny --json
@@ -481,6 +516,7 @@ COMMANDS = {
     "track": (_add_track, _track),
     "inputs": (_add_inputs, _inputs),
     "publish": (_add_publish, _publish),
+    "second_view": (_add_second_view, _second_view),
     "convert": (_add_convert, _convert),
     "export": (_add_export, _export),
 }
