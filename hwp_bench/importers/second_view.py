@@ -10,7 +10,7 @@ ray, follow from both pictures.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -61,7 +61,7 @@ def read_calibration(path: Path) -> TwoCameras:
     """Read a calibration file.
 
     Raises:
-        BadInput: a field is missing or wrong, or a matrix is no camera's.
+        BadInput: a field is missing or wrong, or a matrix is not a camera's.
     """
     try:
         text = path.open(encoding="utf-8").read(MAX_BYTES)
@@ -150,7 +150,15 @@ def add_second_view(
         licence=second.info.licence,
         frame_count=len(rows),
         perturbations={},
-        source={"kind": KIND, "capture": second.info.id, "digest": second.digest, **asdict(made)},
+        source={
+            "kind": KIND,
+            "capture": second.info.id,
+            "digest": second.digest,
+            "frames": made.second_frames,
+            "at_frames": made.frames,
+            "scale": scale,
+            "distance_px": made.distance_px,
+        },
         digests=None,
     )
     folder = first.root / FREE_VIEW
@@ -207,9 +215,9 @@ def _common_frames(first: Capture, second: Capture, offset: int) -> tuple[np.nda
 def _times(capture: Capture) -> list[int]:
     """The number of each frame in its video or data set."""
     frames = capture.info.source.get("frames")
-    good = isinstance(frames, list) and len(frames) == len(capture)
-    if good and all(isinstance(frame, int) for frame in frames):
-        return list(frames)
+    if isinstance(frames, list) and len(frames) == len(capture):
+        if all(isinstance(frame, int) for frame in frames):
+            return frames
     return list(range(len(capture)))
 
 
