@@ -215,10 +215,9 @@ def _common_frames(first: Capture, second: Capture, offset: int) -> tuple[np.nda
 def _times(capture: Capture) -> list[int]:
     """The number of each frame in its video or data set."""
     frames = capture.info.source.get("frames")
-    if isinstance(frames, list) and len(frames) == len(capture):
-        if all(isinstance(frame, int) for frame in frames):
-            return frames
-    return list(range(len(capture)))
+    if not isinstance(frames, list) or len(frames) != len(capture):
+        return list(range(len(capture)))
+    return frames if all(isinstance(one, int) for one in frames) else list(range(len(frames)))
 
 
 def _cropped(capture: Capture, rows: np.ndarray, K: list[list[float]]) -> np.ndarray:
