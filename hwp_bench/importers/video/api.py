@@ -67,6 +67,8 @@ from hwp_bench.importers.video.usable import say_faults
 #: Version of the fit and the masks. It is raised when they come out otherwise for the same input,
 #: because scores on captures of two versions do not compare.
 IMPORTER_VERSION = 3
+#: What captures of it say in `CaptureInfo.made_by`.
+MADE_BY = f"video {IMPORTER_VERSION}"
 #: Frames on the overlay sheet.
 SHEET_FRAMES = 24
 #: Endings of the names of images that a sheet can be written to.
