@@ -73,8 +73,8 @@ class PoseSamples:
     held_out: list[int]
     #: (4, 4) of the camera at the start.
     viewmat: np.ndarray
-    #: Frames a second.
-    fps: float
+    #: (F,) s, for how long each of them is shown.
+    shown: np.ndarray
 
 
 def sample_poses(
@@ -86,7 +86,7 @@ def sample_poses(
         # In the studio, where the light is as frames have shown it.
         start = avatar.studio.posed()
         clip = {side: start[side].pose[None] for side in avatar.sides}
-        frames, held_out, viewmat, fps = [], [], np.eye(4), 30.0
+        frames, held_out, viewmat, shown = [], [], np.eye(4), np.zeros(0)
         motion = {side: np.zeros((0, 51)) for side in avatar.sides}
     else:
         _check(avatar, capture)
@@ -105,12 +105,13 @@ def sample_poses(
             motion[side] = np.stack(
                 [np.append(poses[frame].pose.ravel(), poses[frame].transl) for frame in frames]
             )
-        viewmat, fps = capture.camera(fitted[0]).viewmat, float(capture.info.fps)
+        viewmat, times = capture.camera(fitted[0]).viewmat, capture.info.frame_times()[frames]
+        shown = np.diff(times, append=times[-1] + 1.0 / capture.info.fps)
     baked = {
         side: np.concatenate([poses, _random(avatar, side, poses, settings.random_samples, random)])
         for side, poses in clip.items()
     }
-    return PoseSamples(baked, start, frames, motion, held_out, viewmat, fps)
+    return PoseSamples(baked, start, frames, motion, held_out, viewmat, shown)
 
 
 def hand_controls(avatar: WildGHandAvatar, side: str) -> dict[str, Any]:
@@ -345,7 +346,7 @@ def write_page(
             for side, baked in hands.items()
         ],
         "viewmat": samples.viewmat.tolist(),
-        "fps": samples.fps,
+        "shown": samples.shown.round(4).tolist(),
         "frames": samples.frames,
         "omega": _by_frame(avatar, samples.frames),
         "weights": _weights(avatar, samples.frames),

@@ -340,6 +340,25 @@ def test_what_was_baked_from_one_pose_is_that_pose(fitted) -> None:
     np.testing.assert_allclose(colors, truth.colors, atol=1e-5)
 
 
+def test_frames_are_played_at_the_pace_at_which_they_were_recorded(fitted) -> None:
+    """Oracle: the times of the capture, also where frames are left out."""
+    avatar, capture = fitted
+    count = len(capture)
+    times = np.cumsum([0.0, *np.resize([0.033, 0.067, 0.035], count - 1)])
+    slow = Capture(
+        capture.root,
+        dataclasses.replace(capture.info, times=tuple(times)),
+        capture.hands,
+        capture.cameras,
+    )
+    for most in (240, 5):
+        settings = dataclasses.replace(SMALL, most_frames=most)
+        samples = sample_poses(avatar, slow, settings)
+        assert len(samples.shown) == len(samples.frames) <= most
+        np.testing.assert_allclose(samples.shown[:-1], np.diff(times[samples.frames]))
+        assert samples.shown[-1] == pytest.approx(1 / 30)
+
+
 def test_without_a_capture_a_page_opens_as_the_studio_shows_the_hand(fitted) -> None:
     avatar, _ = fitted
     samples = sample_poses(avatar, None, SMALL)
