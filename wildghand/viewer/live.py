@@ -137,8 +137,8 @@ class LivePage:
         for number, hand in enumerate(hands):
             # The camera looks along z with y down; the page's vertical is z.
             x, y, z = (_ENLARGED * (hand.vertices - middle)).T
-            solid = trimesh.Trimesh(np.stack([x, z, -y], axis=1), hand.faces, process=False)
-            solid.visual.vertex_colors = hand.colors
+            places = np.stack([x, z, -y], axis=1)
+            solid = trimesh.Trimesh(places, hand.faces, vertex_colors=hand.colors, process=False)
             self._meshes.append(self._server.scene.add_mesh_trimesh(f"hand{number}", solid))
         self._text.content = "The hand, as far as the import has fitted it. The mouse turns it."
 
