@@ -126,8 +126,8 @@ def _video(args: argparse.Namespace, world: World) -> int:
             options,
             overwrite=args.overwrite,
             world=world,
-            watch=served and served.watch,
-            glimpse=served and served.glimpse,
+            watch=None if served is None else served.watch,
+            glimpse=None if served is None else served.glimpse,
         )
     if world.is_main:
         print_json(made.facts()) if args.json else _print(made)
@@ -175,7 +175,7 @@ def _capture(args: argparse.Namespace, world: World) -> int:
             all_frames=args.all_frames is True,
             overwrite=args.overwrite,
             world=world,
-            watch=served and served.watch,
+            watch=None if served is None else served.watch,
         )
     if not world.is_main:
         return 0
