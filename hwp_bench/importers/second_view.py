@@ -149,6 +149,8 @@ def add_second_view(
         device=second.info.device,
         licence=second.info.licence,
         frame_count=len(rows),
+        # The frames of the clip are apart: their times are those of `at_frames`.
+        times=None,
         perturbations={},
         source={
             "kind": KIND,

@@ -77,6 +77,7 @@ def imported(path: Path, hand: HandParameters, K: np.ndarray, start: int) -> Cap
             "crop": {"side": SIDE, "corners": corners.tolist()},
         },
         licence="CC0-1.0",
+        times=tuple(0.07 * frame + 0.01 * (frame % 2) for frame in range(COUNT)),
     )
     cameras = Cameras(
         CropWindows(corners, SIDE, SIZE).intrinsics(K), np.tile(np.eye(4), (COUNT, 1, 1))
@@ -167,6 +168,8 @@ def test_what_contradicts_the_calibration_is_refused(pair: Pair, tmp_path: Path)
     with pytest.raises(UsageError, match="--force"):
         add_second_view(front, side, calibration())
     made = add_second_view(front, side, calibration(offset=OFFSET + 20), overwrite=True)
+    # Fewer frames than the capture, whose times are not the clip's.
+    assert open_capture(front.root).free_view.info.times is None
     assert (made.frames[0], made.second_frames[0]) == (0, 10)
     # A capture that was not cropped from a video has no whole frames to calibrate.
     other = imported(tmp_path / "other", front.hands["right"], FIRST, 10)
