@@ -8,6 +8,7 @@ are drawn: `clean-share.png`, `.svg`, and `tables/clean-share.*`, which
 `hwp-bench table runs/persistent/*/* --by clean-share` prints too.
 
 `--captures 0 3 4 7` takes some of the eight captures, whose results are then no suite's.
+`--page docs/clean_share.md` also writes table and figure as a page.
 """
 
 from __future__ import annotations
@@ -20,11 +21,12 @@ from typing import Any
 
 from hwp_bench.api import evaluate
 from hwp_bench.base.errors import UsageError
-from hwp_bench.base.tables import to_markdown, write_tables
+from hwp_bench.base.files import atomic_write
+from hwp_bench.base.tables import Table, to_markdown, write_tables
 from hwp_bench.methods.manifest import find_method, read_manifest
 from hwp_bench.report.clean_share import clean_share_table, write_clean_share
 from hwp_bench.report.sources import find_captures
-from hwp_bench.results import read_all
+from hwp_bench.results import Results, read_all
 from hwp_bench.sim.produce.capture import ensure_suite, suite
 
 #: The methods by the names of their folders: where they are, and settings. The two baselines are
@@ -75,8 +77,12 @@ def run(name: str, percent: int, seed: int, args: argparse.Namespace) -> Path:
     return out
 
 
-def draw(out: Path, names: Sequence[str]) -> None:
-    """Draw and print every result of a folder, methods in the order of `METHODS`."""
+def draw(out: Path, names: Sequence[str], page: Path | None = None) -> None:
+    """Draw and print every result of a folder, methods in the order of `METHODS`.
+
+    Args:
+        page: Markdown file that also shows them, with a picture in `pictures` next to it.
+    """
     folders = [
         file.parent for name in names for file in sorted((out / name).glob("*/results.json"))
     ]
@@ -88,6 +94,40 @@ def draw(out: Path, names: Sequence[str]) -> None:
     write_tables(out / "tables", {"clean-share": table})
     write_clean_share(out, results, captures, METRIC)
     print(to_markdown(table))
+    if page is not None:
+        picture = page.parent / "pictures" / "clean-share.png"
+        picture.parent.mkdir(parents=True, exist_ok=True)
+        picture.write_bytes((out / "clean-share.png").read_bytes())
+        atomic_write(page, _page(results, table))
+
+
+def _page(results: Sequence[Results], table: Table) -> str:
+    """The page's Markdown."""
+    facts = {
+        "Captures": {capture.id for one in results for capture in one.captures},
+        "Steps of a fit": {str(one.budget.get("steps") or "the method's own") for one in results},
+        "Results of": {one.started[:10] for one in results},
+        "Method digests": {one.method.digest[:12] for one in results},
+        "Processor": {str(one.environment.get("processor", "unknown")) for one in results},
+    }
+    rows = [f"| {name} | {', '.join(sorted(values))} |" for name, values in facts.items()]
+    return "\n".join(
+        [
+            "# Scores over the share of clean frames",
+            "",
+            "This page is written by `benchmarks/persistent.py` from result files. The captures are",
+            "[perturbed for most of their time](simulation.md#persistent-perturbations).",
+            "",
+            "| | |",
+            "| --- | --- |",
+            *rows,
+            "",
+            "![Score of every method over the share of clean frames](pictures/clean-share.png)",
+            "",
+            to_markdown(table),
+            "",
+        ]
+    )
 
 
 def main() -> None:
@@ -102,6 +142,7 @@ def main() -> None:
     add("--budget", type=float, metavar="SECONDS", help="seconds of a fit (no limit)")
     add("--jobs", type=int, default=1, help="captures at once (1)")
     add("--draw", action="store_true", help="only draw the results that are there")
+    add("--page", type=Path, metavar="FILE", help="also write a Markdown page")
     args = parser.parse_args()
     if not args.draw:
         # Seed by seed and share by share, so that a command that is stopped leaves whole columns.
@@ -109,7 +150,7 @@ def main() -> None:
             for percent in args.shares:
                 for name in args.methods:
                     run(name, percent, seed, args)
-    draw(args.out, args.methods)
+    draw(args.out, args.methods, args.page)
 
 
 if __name__ == "__main__":

@@ -91,7 +91,7 @@ def scores_by_share(
     firsts: dict[str, Results] = {}
     curves: dict[str, dict[float, dict[str, np.ndarray]]] = {}
     seeds: dict[tuple[str, float], tuple[int, ...]] = {}
-    for run in group_runs(results):
+    for run in group_runs([_of_its_captures(result) for result in results]):
         key = same_but_seed(replace(run.first, suite=""))
         firsts.setdefault(key, run.first)
         for capture in run.first.captures:
@@ -122,6 +122,12 @@ def scores_by_share(
         for share, values in curve.items()
     ]
     return sorted(found, key=lambda one: one.share)
+
+
+def _of_its_captures(result: Results) -> Results:
+    """A result under its captures' digests in place of a suite: captures of none share a name."""
+    digests = sorted(capture.digest for capture in result.captures)
+    return replace(result, suite=" ".join(digests))
 
 
 def _behind(

@@ -58,6 +58,15 @@ def test_a_method_is_one_curve_over_its_suites(study) -> None:
     assert shown == [(10, 1, 1), (10, 1, 1), (60, 1, 1), (60, 1, 1)]
 
 
+def test_captures_of_no_suite_are_told_apart_by_their_digests(study) -> None:
+    results, captures = study
+    named = scores_by_share(results, captures, "psnr")
+    unnamed = scores_by_share([replace(one, suite="captures") for one in results], captures, "psnr")
+    assert [(one.share, one.score.value) for one in unnamed] == [
+        (one.share, one.score.value) for one in named
+    ]
+
+
 def test_a_share_is_said_or_counted(make_capture) -> None:
     # Of 20 frames 16 are trained on, of which frames 1, 5, 9 and 13 are blurred.
     info = make_capture("capture2").info
