@@ -131,7 +131,8 @@ def test_the_page_draws_a_frame_with_its_biases(opened, fitted) -> None:
             opened.execute_script("avatar.setShown(arguments[0])", kind)
             pictures[kind] = drawn(opened, capture, frames[row])
         truth = biased(avatar, capture, frames[row])
-        assert psnr(pictures["biases"], truth[..., :3], truth[..., 3]) > LEAST
+        # The oracle has no wall in the wrist.
+        assert psnr(pictures["biases"], truth[..., :3], truth[..., 3]) > 35.0
         assert psnr(pictures["clean"], truth[..., :3], truth[..., 3]) < 28.0
     opened.execute_script("avatar.setShown('clean')")
 

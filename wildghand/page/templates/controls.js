@@ -246,7 +246,7 @@ function start() {
       if (name !== "relight") one("relight").checked = true;
       changed();
     });
-  const can = { biases: hands.some((h) => h.biases), weights: hands.some((h) => h.trusted) };
+  const can = { biases: hands.some((h) => h.data.biases), weights: hands.some((h) => h.data.trusted) };
   for (const [kind, there] of Object.entries(can)) {
     const option = one("shown").querySelector(`[value=${kind}]`);
     option.hidden = option.disabled = !there;
@@ -259,7 +259,7 @@ function start() {
     changed();
   }
   one("shown").addEventListener("input", () => setShown(one("shown").value));
-  one("visibility").hidden = !hands.some((hand) => hand.seen);
+  one("visibility").hidden = !hands.some((hand) => hand.data.seen);
   one("unseen").addEventListener("input", () => changed());
   function setBackground(color) {
     one("background").value = color;
