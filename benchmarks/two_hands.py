@@ -16,10 +16,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from hwp_bench.importers.shared.landmarks import HandTracks, read_landmarks, write_hand_tracks
 from hwp_bench.importers.video import ImportedClip, SolveSettings, VideoImport, import_video
+from hwp_bench.importers.video.decode import FrameRange, probe, read_frames
 
 #: Shift of the mirror image to the left when it is apart, and to the right when it is nearest, px.
 APART, NEAR = 170.0, 150.0
@@ -58,12 +58,10 @@ def compose(video: Path, landmarks: Path, folder: Path, *, frames: int, stride: 
     """
     with np.load(landmarks) as stored:
         image, world = (stored[name][: frames * stride : stride] for name in ("image", "world"))
-    capture = cv2.VideoCapture(str(video))
-    pictures: list[NDArray[np.uint8]] = []
-    for index in range(frames * stride):
-        picture = capture.read()[1]
-        if index % stride == 0:
-            pictures.append(np.asarray(picture, dtype=np.uint8))
+    chosen = FrameRange(stop=frames * stride, stride=stride)
+    pictures = [
+        np.ascontiguousarray(rgb[:, :, ::-1]) for _, rgb in read_frames(probe(video), chosen)
+    ]
     height, width = pictures[0].shape[:2]
     nearness = np.sin(np.linspace(0, np.pi, frames))
     shift = np.round(nearness * (APART + NEAR) - APART)
@@ -96,7 +94,10 @@ def compose(video: Path, landmarks: Path, folder: Path, *, frames: int, stride: 
 
 def measure(composed: Composed, clip: ImportedClip) -> dict[str, object]:
     """Compare an import of a composed clip with the landmarks that are known."""
-    found: dict[str, object] = {"swaps": composed.swaps, "swaps_repaired": clip.source.swaps}
+    found: dict[str, object] = {
+        "swaps": composed.swaps,
+        "swaps_repaired": clip.facts()["swaps_repaired"],
+    }
     for side, true in zip(("right", "left"), composed.true, strict=True):
         read = read_landmarks(composed.landmarks, min_score=0.5, side=side)
         apart = np.abs(read.image - true)[read.detected].max()

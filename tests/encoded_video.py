@@ -96,8 +96,12 @@ def write_pictures(
     container_options: dict[str, str] | None = None,
     aspect: Fraction | None = None,
     sound: float = 0.0,
+    times: Sequence[int] | None = None,
 ) -> Path:
-    """Write frames (H, W, 3) uint8; with `sound` there are as many seconds of silence too."""
+    """Write frames (H, W, 3) uint8; with `sound` there are as many seconds of silence too.
+
+    `times`, ms: when each is shown; None: 30 a second.
+    """
     import av
 
     height, width = images[0].shape[:2]
@@ -107,8 +111,12 @@ def write_pictures(
         if aspect is not None:
             stream.codec_context.sample_aspect_ratio = aspect
         noise: Any = container.add_stream("aac", rate=44100) if sound else None
-        for image in images:
+        if times is not None:
+            stream.codec_context.time_base = Fraction(1, 1000)
+        for number, image in enumerate(images):
             frame = av.VideoFrame.from_ndarray(image, format="rgb24")
+            if times is not None:
+                frame.pts, frame.time_base = times[number], Fraction(1, 1000)
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
         if noise is not None:

@@ -2,11 +2,11 @@
 
 Runs in its own environment, because MediaPipe pins old packages:
 
-    python -m venv tracker && tracker/bin/pip install mediapipe==0.10.21
+    python -m venv tracker && tracker/bin/pip install mediapipe==0.10.21 .
     tracker/bin/python tools/track_mediapipe.py hand.mp4 hand.npz --hand right
 
 Version 0.10.21 is the newest that carries its models inside the package, so nothing is downloaded
-while it runs. This file needs nothing of the toolkit.
+while it runs. Frames are decoded as the import decodes them.
 
 The result is an .npz with one row for every frame of the video: `image` (F, 21, 3), x and y in
 pixels of the frame and z in the same unit; `world` (F, 21, 3) metres; `score` (F,), 0 where the
@@ -18,9 +18,12 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from typing import Any, Iterator, Protocol  # noqa: UP035  (trackers run on old Pythons)
+from collections.abc import Iterator
+from typing import Any, Protocol
 
 import numpy as np
+
+from hwp_bench.importers.video import decode
 
 #: MediaPipe takes every image for a mirrored selfie: on other images its labels are swapped.
 SWAPPED = {"Right": "left", "Left": "right"}
@@ -76,14 +79,7 @@ def _choose(found: Any, hand: str) -> int | None:
 
 def read_frames(path: str) -> Iterator[np.ndarray]:
     """Yield the frames of a video as RGB."""
-    import cv2
-
-    video = cv2.VideoCapture(path)
-    while True:
-        good, frame = video.read()
-        if not good:
-            return
-        yield np.ascontiguousarray(frame[:, :, ::-1])
+    return (frame for _, frame in decode.read_frames(decode.probe(path), decode.FrameRange()))
 
 
 def write(path: str, tracked: dict[str, np.ndarray]) -> None:
@@ -96,7 +92,7 @@ def write(path: str, tracked: dict[str, np.ndarray]) -> None:
 def main() -> int:
     """Run the program; returns the exit status."""
     parser = argparse.ArgumentParser(description="Track one hand in a video with MediaPipe.")
-    parser.add_argument("video", help="any video that OpenCV decodes, not mirrored")
+    parser.add_argument("video", help="any video that the toolkit reads, not mirrored")
     parser.add_argument("out", help=".npz to write")
     parser.add_argument("--hand", choices=("right", "left", "any"), default="any")
     parser.add_argument("--min-confidence", type=float, default=0.5)

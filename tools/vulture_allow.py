@@ -19,6 +19,7 @@ _.ambient_rate  # `Recipe.rates` reads it by the tensor's name
 _.betas_rate  # `Recipe.rates` reads it by the tensor's name
 _.bias_rate  # `Recipe.rates` reads it by the tensor's name
 _.displacement_rate  # `Recipe.rates` reads it by the tensor's name
+_.parts_seen  # programs read it in the JSON of a fit
 _.frame_rate  # `Recipe.rates` reads it by the tensor's name
 _.gaussian_rate  # `Recipe.rates` reads it by the tensor's name
 _.identity_rate  # `Recipe.rates` reads it by the tensor's name

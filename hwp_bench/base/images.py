@@ -12,7 +12,7 @@ import hashlib
 import itertools
 import os
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
 from types import ModuleType
@@ -292,7 +292,12 @@ def check_encoder() -> ModuleType:
     return library
 
 
-def write_movie(path: str | os.PathLike[str], frames: Iterable[np.ndarray], fps: float) -> Path:
+def write_movie(
+    path: str | os.PathLike[str],
+    frames: Iterable[np.ndarray],
+    fps: float,
+    times: Sequence[float] | None = None,
+) -> Path:
     """Write a video, whole or not at all.
 
     H.264, 4:2:0, its index first, so that a browser plays it while it loads.
@@ -300,13 +305,15 @@ def write_movie(path: str | os.PathLike[str], frames: Iterable[np.ndarray], fps:
     Args:
         frames: (H, W, 3) uint8 sRGB, all of one size, read as they are needed. 4:2:0 has even
             sizes: an odd row or column at the end is doubled.
+        fps: frames per second.
+        times: when each frame is shown, s, rising from 0, where the steps between them differ.
     """
     path = Path(path)
     av = check_encoder()
     partial = path.with_name(f".{os.getpid()}.{path.stem}.mp4")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        _encode(av, partial, iter(frames), fps, path)
+        _encode(av, partial, iter(frames), fps, times, path)
         os.replace(partial, path)
     except (OSError, av.error.FFmpegError) as error:
         raise HwpError(f"cannot be written as a video ({error})", where=path) from error
@@ -317,7 +324,12 @@ def write_movie(path: str | os.PathLike[str], frames: Iterable[np.ndarray], fps:
 
 
 def _encode(
-    av: ModuleType, partial: Path, frames: Iterator[np.ndarray], fps: float, path: Path
+    av: ModuleType,
+    partial: Path,
+    frames: Iterator[np.ndarray],
+    fps: float,
+    times: Sequence[float] | None,
+    path: Path,
 ) -> None:
     first = next(frames, None)
     if first is None:
@@ -325,13 +337,14 @@ def _encode(
     with av.open(str(partial), "w", format="mp4", options={"movflags": "faststart"}) as container:
         height, width = (edge + edge % 2 for edge in first.shape[:2])
         rate = Fraction(fps).limit_denominator(1000)
+        clock = 1 / rate if times is None else Fraction(1, 90_000)
         options = {"crf": str(QUALITY), "preset": "medium", "profile": "high"}
         stream = container.add_stream(ENCODER, rate=rate, options=options)
         settings = {
             "width": width,
             "height": height,
             "pix_fmt": "yuv420p",
-            "time_base": 1 / rate,
+            "time_base": clock,
             "colorspace": _MATRIX,
             "color_primaries": _PRIMARIES,
             "color_trc": _TRANSFER,
@@ -346,7 +359,7 @@ def _encode(
                     f"frame {number} has shape {image.shape} and type {image.dtype}", where=path
                 )
             frame = av.VideoFrame.from_ndarray(yuv_planes(image), format="yuv420p")
-            frame.pts = number
+            frame.pts = number if times is None else round(times[number] / clock)
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
 

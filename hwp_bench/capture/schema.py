@@ -92,7 +92,7 @@ class CaptureInfo:
     action: Text
     #: Device that recorded it.
     device: Text
-    #: Frames per second.
+    #: Frames per second; their mean where `times` are given.
     fps: FrameRate
     #: Width of every frame, in pixels.
     width: _Edge
@@ -110,6 +110,14 @@ class CaptureInfo:
     licence: Text
     #: SHA-256 of the content by part (`frames`, `masks`, `hands`, ...); empty before writing.
     digests: Mapping[str, str] | None = None
+    #: When each frame was recorded, s from the first, rising; None where all steps are equal.
+    times: tuple[float, ...] | None = None
+
+    def frame_times(self) -> np.ndarray:
+        """Return when each frame was recorded, (F,) s from the first."""
+        if self.times is None:
+            return np.arange(self.frame_count) / self.fps
+        return np.array(self.times)
 
     @property
     def sides(self) -> tuple[str, ...]:
@@ -162,9 +170,11 @@ class CaptureInfo:
 
     def to_json(self) -> dict[str, Any]:
         """Return the JSON object that `from_json` reads."""
+        # Captures of an even rate stay as versions without times wrote them.
+        written = {k: v for k, v in vars(self).items() if k != "times" or v is not None}
         return {
             "schema": SCHEMA,
-            **vars(self),
+            **written,
             "fps": float(self.fps),
             "hand_model": dict(vars(self.hand_model)),
             "perturbations": {
@@ -190,6 +200,7 @@ class CaptureInfo:
             remedy="Write the capture again with this version of the toolkit.",
         )
         # Readers of this version have always skipped unknown fields.
+        content = {"times": None, **content}
         info = parse_record(
             cls, content, where=where, error=BadCapture, complete=True, ignore_unknown=True
         )
@@ -202,6 +213,11 @@ class CaptureInfo:
                 said = f"must be null or a list of {info.frame_count} severities"
                 raise BadCapture(said, where=where, field=place)
             check_severity(values, where=where, field=place)
+        if info.times is not None:
+            steps = np.diff(info.times)
+            if len(info.times) != info.frame_count or info.times[0] != 0 or (steps <= 0).any():
+                said = f"must be null or {info.frame_count} rising seconds, the first 0"
+                raise BadCapture(said, where=where, field="times")
         check_id(info.id, where)
         return info
 

@@ -280,7 +280,9 @@ def _track(args: argparse.Namespace) -> int:
         from hwp_bench.base.images import write_image
         from hwp_bench.tracking.track_video import landmark_sheet
 
-        write_image(args.sheet, landmark_sheet(tracked))
+        write_image(
+            args.sheet, landmark_sheet(tracked.video, tracked.reading.frames, tracked.hands)
+        )
     facts = tracked.facts()
     frames = tracked.reading.counted()
     lines = [f"{out}: {frames} frames, {facts['frames_per_second']:.1f} frames per second"]

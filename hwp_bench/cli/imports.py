@@ -119,7 +119,7 @@ def _print_video(clip: ImportedClip, args: argparse.Namespace) -> None:
     )
     print(f"capture: {args.out}, {facts['frames']} frames, {detected}")
     if len(clip.hands) == 2:
-        print(f"exchanged by the tracker and put right: {clip.source.swaps} times")
+        print(f"exchanged by the tracker and put right: {facts['swaps_repaired']} times")
     for side, hand in clip.hands.items():
         error, before = hand.error, hand.error_landmarks_only
         print(

@@ -21,6 +21,7 @@ import numpy as np
 from hwp_bench.base.console import progress
 from hwp_bench.base.drawing import labelled, sheet
 from hwp_bench.base.errors import HwpError, UsageError
+from hwp_bench.base.images import write_image
 from hwp_bench.hands.raster import draw_dots
 from hwp_bench.hands.skeleton import draw_bones
 from hwp_bench.importers.shared.landmarks import HandTracks, write_hand_tracks
@@ -356,8 +357,10 @@ def track_video(
     warn_of_damage(info, endings[0])
     hands = collected.hands((info.width, info.height), settings.hands)
     if hands is None:
+        shown = out.with_suffix(".jpg")
+        write_image(shown, landmark_sheet(info, collected.frames, None))
         raise NoHandSeen(
-            f"none of {collected.frames} frames shows a hand",
+            f"none of {collected.frames} frames shows a hand ({shown} has some of them)",
             where=info.path,
             remedy="The whole hand must be visible. Lower --min-confidence to accept less.",
         )
@@ -389,18 +392,20 @@ COLOURS = {"right": (255, 160, 0), "left": (60, 200, 255)}
 _COUNT, _COLUMNS, _EDGE = 16, 4, 320
 
 
-def landmark_sheet(tracked: TrackedVideo) -> np.ndarray:
-    """Draw frames, evenly spaced over a video, with their hands: (H, W, 3) uint8."""
-    frames = tracked.hands.score.shape[1]
+def landmark_sheet(video: VideoInfo, frames: int, hands: HandTracks | None) -> np.ndarray:
+    """Draw some of a video's `frames`, evenly spaced, with their hands: (H, W, 3) uint8."""
     stride = -(-frames // _COUNT)
-    left, top, right, bottom = _window(tracked.hands)
+    left, top, right, bottom = 0, 0, video.width, video.height
+    if hands is not None:
+        left, top, right, bottom = _window(hands)
     tiles: list[np.ndarray] = []
-    for index, frame in read_frames(tracked.video, FrameRange(stride=stride)):
+    for index, frame in read_frames(video, FrameRange(stride=stride)):
         if index < frames and len(tiles) < _COUNT:
             part = np.ascontiguousarray(frame[top:bottom, left:right])
             scale = _EDGE / max(part.shape[:2])
             part = cv2.resize(part, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-            _draw_landmarks(part, tracked.hands, index, (left, top), scale)
+            if hands is not None:
+                _draw_landmarks(part, hands, index, (left, top), scale)
             tiles.append(labelled(part, str(index)))
     return sheet(tiles, _COLUMNS)
 

@@ -52,7 +52,12 @@ def render_clip(
                 images.append(image)
         if video is not None:
             # Within the block: where the video cannot be written, no folder refuses the next start.
-            write_movie(video, images, capture.info.fps)
+            times = None
+            if capture.info.times is not None:
+                times = [
+                    capture.info.times[frame] - capture.info.times[frames[0]] for frame in frames
+                ]
+            write_movie(video, images, capture.info.fps, times)
     return {"frames": len(frames), "frames_per_second": len(frames) / max(seconds, 1e-9)}
 
 

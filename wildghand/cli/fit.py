@@ -136,6 +136,9 @@ def _print(made: MadeAvatar) -> None:
         print(f"video: {facts['video']['warning']}")
     for name in ("turntable", "sheet", "page"):
         print(f"{name}: {facts[name]}")
+    verdict = made.verdict()
+    for line in () if verdict is None else verdict.lines():
+        print(line)
     took = ", ".join(f"{one['name']} {one['seconds']:.0f}" for one in facts["stages"])
     print(f"seconds: {took}")
 

@@ -236,8 +236,9 @@ def capture_motion(
         avatar.believed({side: hand.at(frame, side) for side, hand in hands.items()})
         for frame in kept.tolist()
     ]
+    times = capture.info.frame_times()[kept]
     return PoseSequence(
-        times=(kept - kept[0]) / capture.info.fps,
+        times=times - times[0],
         poses={side: np.stack([frame[side].pose for frame in frames]) for side in sides},
         transls={side: np.stack([frame[side].transl for frame in frames]) for side in sides},
         down=True,

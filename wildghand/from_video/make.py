@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
+
+import psutil
 
 from hwp_bench.base.errors import BadInput, UsageError, of_type, place, real_number, whole_number
 from hwp_bench.base.folders import exclusive
@@ -15,12 +18,21 @@ from hwp_bench.base.images import check_encoder
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.importers.video.decode import probe
 from hwp_bench.methods.contract import Budget
+from hwp_bench.tracking.networks import LiteRtNetworks, load_models
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import DESCRIPTION, load_avatar
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
 from wildghand.fitting.session import Watch, fit_capture
-from wildghand.from_video.run import JobRecord, VideoFit, VideoJob, run_stages, with_quick
+from wildghand.from_video.run import (
+    FRAMES,
+    JobRecord,
+    VideoFit,
+    VideoJob,
+    run_stages,
+    with_quick,
+)
 from wildghand.from_video.stages import STAGES
+from wildghand.from_video.verdict import Verdict, read_verdict
 from wildghand.model.settings import read_settings
 
 
@@ -44,9 +56,13 @@ class MadeAvatar:
             return dict(video) if isinstance(video, Mapping) else {}
         return {}
 
+    def verdict(self) -> Verdict | None:
+        """Return how good the avatar is, and what to film next; None where `work` is gone."""
+        return read_verdict(self.job.verdict) if self.job.verdict.is_file() else None
+
     def facts(self) -> dict[str, Any]:
         """Return what a program wants to know of it, for JSON."""
-        fit, job = self.avatar.record, self.job
+        fit, job, verdict = self.avatar.record, self.job, self.verdict()
         return {
             "avatar": str(job.folder),
             "hands": list(self.avatar.sides),
@@ -58,6 +74,7 @@ class MadeAvatar:
             "page": str(job.page),
             "capture": str(job.capture),
             "video": self.video_facts(),
+            "verdict": None if verdict is None else asdict(verdict),
             "stages": [
                 {
                     "name": name,
@@ -112,9 +129,8 @@ def make_avatar(
     chosen = read_settings(options.method_settings())
     world.shard(chosen.schedule.batch)
     if world.is_main:
-        probe(job.video)
-        check_encoder()
         _check_folder(job, overwrite=overwrite)
+        _check_requirements(job)
     with exclusive(job.work) if world.is_main else contextlib.nullcontext():
         if overwrite and world.is_main:
             job.record.unlink(missing_ok=True)
@@ -138,6 +154,34 @@ def _check_folder(job: VideoJob, *, overwrite: bool) -> None:
         where=folder,
         remedy="Choose another name, or delete it.",
     )
+
+
+# Bytes of a job, for each stored frame and for all the rest: on the disk, and in memory, where the
+# import holds frames at twice the stored edge too.
+_DISK_FRAME, _DISK_REST = 400_000, 100_000_000
+_MEMORY_FRAME, _MEMORY_REST = 1_500_000, 1_500_000_000
+
+
+def _check_requirements(job: VideoJob) -> None:
+    """Check what a job needs before anything of it is made: video, programs, disk, memory."""
+    info = probe(job.video)
+    check_encoder()
+    if job.options.landmarks is None and not job.landmarks.is_file():
+        LiteRtNetworks(load_models(job.options.tracker))
+    frames = min(info.stated_frames or FRAMES, job.options.most_frames)
+    place = next(one for one in (job.folder, *job.folder.absolute().parents) if one.is_dir())
+    left = {
+        "of disk": (_DISK_REST + _DISK_FRAME * frames, shutil.disk_usage(place).free),
+        "of memory": (_MEMORY_REST + _MEMORY_FRAME * frames, psutil.virtual_memory().available),
+    }
+    for name, (needed, free) in left.items():
+        if needed > free:
+            raise UsageError(
+                f"{frames} frames need about {needed / 1e9:.1f} GB {name}, {free / 1e9:.1f} GB are "
+                "free",
+                where=place,
+                remedy="Make room, or take fewer frames with --quick.",
+            )
 
 
 def is_video(source: str | os.PathLike[str]) -> bool:

@@ -8,6 +8,7 @@ my_hand/work                can be deleted once the avatar pleases; a second run
     landmarks.npz           the tracked hands
     capture/                the imported capture
     avatar/, avatar.fit/    the finished fit; the state of one that goes on
+    verdict.json            how good the avatar is, and what to film next
     stages.json             what is done, with which video and settings
 
 The record of a job says which stages have ended, and with which facts, so that a stopped job goes
@@ -124,6 +125,7 @@ class VideoJob:
         self.fit = self.fitted / DESCRIPTION
         self.avatar = folder / DESCRIPTION
         self.turntable = folder / "turntable.mp4"
+        self.verdict = self.work / "verdict.json"
         self.sheet = folder / "sheet.jpg"
         self.page = folder / "avatar.html"
 

@@ -17,20 +17,21 @@ from hwp_bench.base.arrays import evenly
 from hwp_bench.base.console import notice, track
 from hwp_bench.base.drawing import fitted, labelled, sheet
 from hwp_bench.base.errors import BadInput, HwpError, reason_of
-from hwp_bench.base.files import canonical_json, check_is_file, sha256_of
+from hwp_bench.base.files import canonical_json, check_is_file, sha256_of, write_json
 from hwp_bench.base.images import as_uint8, read_gray, write_image, write_movie
 from hwp_bench.capture import Capture, open_capture
-from hwp_bench.importers.shared.landmarks import read_sides
+from hwp_bench.importers.shared.landmarks import read_hand_tracks, read_sides
 from hwp_bench.importers.video import FrameRange, VideoImport, import_video
 from hwp_bench.importers.video.api import IMPORTER_VERSION
 from hwp_bench.importers.video.decode import probe
 from hwp_bench.methods.contract import Budget
 from hwp_bench.tracking import TrackerSettings, track_video
-from hwp_bench.tracking.track_video import NoHandSeen
+from hwp_bench.tracking.track_video import NoHandSeen, landmark_sheet
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import DESCRIPTION, MODEL, WEIGHTS, load_avatar
 from wildghand.fitting.session import fit_capture, unfinished
 from wildghand.from_video.run import Stage, VideoJob
+from wildghand.from_video.verdict import judge_avatar, read_verdict
 from wildghand.model.settings import read_settings
 from wildghand.page import write_page
 
@@ -134,9 +135,16 @@ def draw_turntable(job: VideoJob, avatar: WildGHandAvatar) -> None:
     write_movie(job.turntable, (table.view(angle) for angle in angles), FPS)
 
 
+def write_verdict(job: VideoJob, avatar: WildGHandAvatar) -> None:
+    """Judge the avatar by its capture."""
+    write_json(job.verdict, asdict(judge_avatar(avatar, open_capture(job.capture))))
+
+
 def draw_sheet(job: VideoJob, avatar: WildGHandAvatar) -> None:
     """Draw the contact sheet: frames, the avatar in their poses, its weights, and all sides."""
     drawn = avatar_sheet(avatar, open_capture(job.capture), job.folder / WEIGHTS)
+    for line in reversed(read_verdict(job.verdict).lines()):
+        drawn = labelled(drawn, line)
     write_image(job.sheet, drawn)
 
 
@@ -228,6 +236,7 @@ def import_options(job: VideoJob) -> VideoImport:
         id=job.capture_id,
         hand_model=job.options.hand_model,
         overwrite=True,
+        strict=True,
         fit=job.options.importer,
     )
     # Where the landmarks do not say the side, only the import's own fit can tell.
@@ -237,9 +246,12 @@ def import_options(job: VideoJob) -> VideoImport:
     seen = {side: int(np.count_nonzero(hand.detected[::step])) for side, hand in hands.items()}
     few = [side for side, count in seen.items() if count < FEWEST]
     if few and (len(few) == len(seen) or job.options.side == "both"):
-        named = f"a {few[0]} hand" if few[0] else "a hand"
+        named, shown = f"a {few[0]} hand" if few[0] else "a hand", job.work / "tracked.jpg"
+        drawn = landmark_sheet(probe(job.video), total, read_hand_tracks(job.landmarks))
+        write_image(shown, drawn)
         raise BadInput(
-            f"shows {named} in {seen[few[0]]} of {total} frames, an avatar needs {FEWEST} or more",
+            f"shows {named} in {seen[few[0]]} of {total} frames, an avatar needs {FEWEST} or more "
+            f"({shown} has some of them)",
             where=job.video,
             remedy="Record some seconds in which the whole hand is visible and turns.",
         )
@@ -332,6 +344,7 @@ STAGES: tuple[Stage, ...] = (
         4.0 + 0.1 * FRAMES,
         draw_turntable,
     ),
-    Picture("sheet", "Drawing the contact sheet", str((1, COLUMNS, EDGE)), 6.0, draw_sheet),
+    Picture("verdict", "Judging the avatar", "1", 6.0, write_verdict),
+    Picture("sheet", "Drawing the contact sheet", str((2, COLUMNS, EDGE)), 6.0, draw_sheet),
     Picture("page", "Writing the page", "1", 15.0, write_avatar_page),
 )

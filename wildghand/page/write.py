@@ -74,8 +74,8 @@ class PoseSamples:
     motion: Mapping[str, np.ndarray]
     #: (4, 4) of the camera.
     viewmat: np.ndarray
-    #: Frames a second.
-    fps: float
+    #: (F,) s, for how long each of them is shown.
+    shown: np.ndarray
 
 
 def sample_poses(
@@ -87,7 +87,7 @@ def sample_poses(
     start = avatar.studio.posed(REST, best_turn(avatar))
     clip = {side: start[side].pose[None] for side in avatar.sides}
     motion = {side: np.zeros((0, 51)) for side in avatar.sides}
-    frames, viewmat, fps = list[int](), np.eye(4), 30.0
+    frames, viewmat, lasts = list[int](), np.eye(4), np.zeros(0)
     if capture is not None:
         _check(avatar, capture)
         fitted = [frame for frame in avatar.record.frames if _shown(avatar, capture, frame)]
@@ -101,12 +101,13 @@ def sample_poses(
             motion[side] = np.stack(
                 [np.append(poses[frame].pose.ravel(), poses[frame].transl) for frame in frames]
             )
-        viewmat, fps = capture.camera(fitted[0]).viewmat, float(capture.info.fps)
+        viewmat, times = capture.camera(fitted[0]).viewmat, capture.info.frame_times()[frames]
+        lasts = np.diff(times, append=times[-1] + 1.0 / capture.info.fps)
     learnt = {
         side: np.concatenate([poses, _random(avatar, side, poses, settings.random_samples, random)])
         for side, poses in clip.items()
     }
-    return PoseSamples(learnt, start, frames, motion, viewmat, fps)
+    return PoseSamples(learnt, start, frames, motion, viewmat, lasts)
 
 
 @torch.no_grad()
@@ -288,7 +289,7 @@ def write_page(
             for side, hand in hands.items()
         ],
         "viewmat": samples.viewmat.tolist(),
-        "fps": samples.fps,
+        "shown": samples.shown.round(4).tolist(),
         "frames": samples.frames,
         "omega": _by_frame(avatar, samples.frames),
         "weights": _weights(avatar, samples.frames),

@@ -104,7 +104,8 @@ class Motion:
     def __init__(self, avatar: WildGHandAvatar, capture: Capture) -> None:
         self._avatar, self._capture = avatar, capture
         self._sides = shown_sides(avatar, capture)
-        self.fps = capture.info.fps
+        #: (F,) s, when each frame was recorded.
+        self.times = capture.info.frame_times()
 
     def __len__(self) -> int:
         return self._capture.info.frame_count
@@ -159,10 +160,16 @@ class Picture:
 
 
 class Player:
-    """Goes round and round from frame to frame; where showing is slower, frames are left out."""
+    """Goes round and round from frame to frame; where showing is slower, frames are left out.
 
-    def __init__(self, count: int, fps: float, show: Callable[[int], None]) -> None:
-        self._count, self._fps, self._show = count, fps, show
+    Args:
+        times: (F,) s, when each frame was recorded, rising from 0.
+        show: shows a frame.
+    """
+
+    def __init__(self, times: np.ndarray, show: Callable[[int], None]) -> None:
+        self._times, self._show = times, show
+        self._step = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
         #: Times the speed of the clip.
         self.speed = 1.0
         self._stop = threading.Event()
@@ -183,11 +190,12 @@ class Player:
             thread.join(timeout=10.0)
 
     def _run(self, frame: int) -> None:
-        place, before = float(frame), time.monotonic()
-        while not self._stop.wait(1.0 / self._fps):
+        moment, before = float(self._times[frame]), time.monotonic()
+        period = float(self._times[-1]) + self._step
+        while not self._stop.wait(self._step):
             now = time.monotonic()
-            place, before = place + (now - before) * self._fps * self.speed, now
-            self._show(int(place) % self._count)
+            moment, before = (moment + (now - before) * self.speed) % period, now
+            self._show(int(np.searchsorted(self._times, moment, side="right")) - 1)
 
 
 #: Edge of the picture that gets everything compiled before a page asks, px.

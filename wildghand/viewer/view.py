@@ -10,6 +10,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from hwp_bench.base.console import notice
 from hwp_bench.base.errors import UsageError
 from hwp_bench.hands.skeleton import FINGERS, JOINT_NAMES, finger_joints
@@ -236,7 +238,7 @@ class Panel:
         self._text = gui.add_markdown("")
         if view.motion is not None:
             with gui.add_folder("motion"):
-                self._player = self._add_motion(len(view.motion), view.motion.fps)
+                self._player = self._add_motion(view.motion.times)
         with gui.add_folder("pose"):
             self._add_poses()
         for side in view.hands:
@@ -308,8 +310,8 @@ class Panel:
             self.show_angles()
             self._put_camera(self._view.studio_viewpoint())
 
-    def _add_motion(self, count: int, fps: float) -> Player:
-        gui, view = self._gui, self._view
+    def _add_motion(self, times: np.ndarray) -> Player:
+        gui, view, count = self._gui, self._view, len(times)
         self._playing = gui.add_checkbox("play", False)
         frame = gui.add_slider("frame", min=0, max=max(count - 1, 1), step=1, initial_value=0)
         speed = gui.add_slider("speed", min=0.1, max=2.0, step=0.1, initial_value=1.0)
@@ -318,7 +320,7 @@ class Panel:
             _put(frame, due)
             view.set_frame(due)
 
-        player = Player(count, fps, show)
+        player = Player(times, show)
 
         @self._playing.on_update
         def _(event: GuiEvent[Any]) -> None:

@@ -46,7 +46,6 @@ from hwp_bench.importers.video.residuals import FIELD_SIZE, REACH, OutlineResidu
 from hwp_bench.importers.video.solve import (
     PICTURE_STEPS,
     FittedClip,
-    Footage,
     ReprojectionError,
     fit_landmarks,
     refine,
@@ -63,6 +62,7 @@ from hwp_bench.importers.video.source import (
     refuse_other_units,
     refuse_unfitted,
 )
+from hwp_bench.importers.video.usable import say_faults
 
 #: Version of the fit and the masks. It is raised when they come out otherwise for the same input,
 #: because scores on captures of two versions do not compare.
@@ -180,7 +180,11 @@ class ImportedClip:
         if len(self.hands) == 1:
             return {**common, **self.first.facts()}
         each = {side: hand.facts() for side, hand in self.hands.items()}
-        repaired = {"swaps_repaired": self.source.swaps, "doubles_left_out": self.source.doubles}
+        tracked = self.source.tracked
+        repaired = {
+            "swaps_repaired": tracked.swaps if tracked else 0,
+            "doubles_left_out": tracked.doubles if tracked else 0,
+        }
         return {**common, **repaired, "hands": each}
 
 
@@ -210,6 +214,7 @@ def import_video(
     call = _call(video, landmarks, out, options)
     source = drop_blank_frames(read_source(video, landmarks, options))
     refuse_other_units(source)
+    say_faults(source, out, options)
     doubts = landmark_doubts(source)
     for doubt in doubts:
         notice(f"warning: {os.fspath(landmarks)}: it seems that {doubt}.")
@@ -330,8 +335,7 @@ def _steps(title: str, total: int) -> Iterator[Callable[[], None]]:
 
 def _fit_hands(source: VideoSource, options: VideoImport) -> list[FittedClip]:
     """Fit the landmarks of each hand, then both to one camera."""
-    settings, video = options.fit, source.video
-    footage = Footage(video.width, video.height, video.fps / options.frames.stride, options.focal)
+    settings, footage = options.fit, source.footage
     steps = settings.start_steps + settings.landmark_steps
     with _steps("fitting landmarks", steps * len(source.hands)) as step:
         fits = [
@@ -441,7 +445,8 @@ def store_clip(
         id=options.capture_id(out),
         action=options.action,
         device=options.device,
-        fps=video.fps / options.frames.stride,
+        fps=source.footage.fps,
+        times=None if source.footage.times is None else tuple(source.footage.times.tolist()),
         perturbations=dict.fromkeys(options.perturbations),
         source={
             "kind": "video",

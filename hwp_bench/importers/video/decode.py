@@ -159,6 +159,23 @@ def probe(path: str | os.PathLike[str]) -> VideoInfo:
         return VideoInfo(path, *size, video.fps, video.stated, video.codec, str(colours))
 
 
+def read_times(path: str | os.PathLike[str]) -> np.ndarray | None:
+    """Read when each frame is shown, (F,) s from the first, without decoding any.
+
+    None where the file does not say it, or has two frames within a millisecond.
+    """
+    stamps: list[float] = []
+    with _opened(Path(path)) as video, contextlib.suppress(_library().error.FFmpegError):
+        for packet in video.packets():
+            if not video.has_clock or packet.pts is None or packet.time_base >= 1:
+                return None
+            stamps.append(float(packet.pts * packet.time_base))
+    times = np.sort(stamps)
+    if len(times) < 2 or np.diff(times).min() < 1e-3:
+        return None
+    return np.asarray(times - times[0])
+
+
 @dataclass(frozen=True, eq=False)
 class ClipImages:
     """The frames of a clip at two resolutions."""
@@ -314,6 +331,8 @@ class _Video:
             self.stated = self._packets - discarded
         if self.stated <= 0 and self._seconds is not None:
             self.stated = max(0, min(round(self._seconds * self.fps), 2**31 - 1))
+        # What FFmpeg makes up for a bare stream jumps.
+        self.has_clock = kind != "MPEG without a container"
         # Half of a packet at the end, of a row of packets of one size.
         self._cut = half_packet
         self.decoded = self._damaged = self._seen = 0
@@ -338,6 +357,12 @@ class _Video:
                 if frame.is_corrupt:
                     self._damaged_at = self.decoded
                 yield self.decoded - 1, frame, self._colours(frame)
+
+    def packets(self) -> Iterator[Any]:
+        """Packets of the frames that are shown, in the order of the file."""
+        for packet in self._container.demux(self._stream):
+            if packet.size and not packet.is_discard:
+                yield packet
 
     def _packets_of_file(self) -> Iterator[Any]:
         """Packets of the video; takes note of how far those of all streams reach."""

@@ -53,7 +53,8 @@ _SIZE_SCALE, _FOCAL_SCALE = 0.05, 0.15
 class LandmarkResidual:
     """Everything that does not need the images: landmarks, smoothness, anatomy, priors.
 
-    `fps` is None where the frames are far apart, so that motion between them is not smooth.
+    `steps` (F - 1,), in units of 1/30 s, lie between the frames; None where these are far apart, so
+    that motion between them is not smooth.
     `default_focal`, px, is what the prior favours; None where the focal length is known.
     """
 
@@ -61,7 +62,7 @@ class LandmarkResidual:
         self,
         landmarks: Landmarks,
         model: ClipModel,
-        fps: float | None,
+        steps: np.ndarray | None,
         default_focal: float | None,
     ) -> None:
         self.default_focal = default_focal
@@ -73,7 +74,7 @@ class LandmarkResidual:
         self.image_scale = IMAGE_SCALE * landmarks.hand_size
         self.limits = anatomical_limits(model.template)
         self.contact = ContactResidual(model.template)
-        self.pace = None if fps is None else (30.0 / fps) ** 2
+        self.steps = steps
         self.prior = _PRIOR_SHARE * float(landmarks.detected.sum())
 
     def __call__(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
@@ -107,8 +108,8 @@ class LandmarkResidual:
     def _rest(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
         free, motion = model.variables, posed.landmarks.new_zeros(())
         for track, scale in ((posed.landmarks, _MOTION_SCALE), (free.fingers, _TURNING_SCALE)):
-            if self.pace is not None and len(track) > 2:
-                bend = (track[2:] - 2.0 * track[1:-1] + track[:-2]) / (scale * self.pace)
+            if self.steps is not None and len(track) > 2:
+                bend = acceleration(track, self.steps, scale)
                 motion = motion + charbonnier((bend**2).sum(dim=-1)).sum()
         anatomy = _LIMIT_WEIGHT * joint_limit_penalty(posed.pose, self.limits).sum()
         anatomy = anatomy + self.contact(model, posed)
@@ -119,6 +120,25 @@ class LandmarkResidual:
             focal = (free.log_focal - float(np.log(self.default_focal))) / _FOCAL_SCALE
             constant = constant + focal**2
         return _MOTION_WEIGHT * motion + (anatomy + 0.5 * self.prior * constant)
+
+
+def acceleration(track: torch.Tensor, steps: np.ndarray, unit: float) -> torch.Tensor:
+    """Return the second derivative of a track (F, ...) by time, (F - 2, ...), in some unit.
+
+    Of frames that are h and k apart it is ((z - y) / k - (y - x) / h) 2 / (h + k): the second
+    divided difference, times 2.
+    """
+    before, after = steps[:-1], steps[1:]
+    shape = (-1, *(1,) * (track.ndim - 1))
+    first, last, scale = (
+        torch.as_tensor(values, dtype=track.dtype).reshape(shape)
+        for values in (
+            2.0 * after / (before + after),
+            2.0 * before / (before + after),
+            unit * (before * after),
+        )
+    )
+    return (last * track[2:] - 2.0 * track[1:-1] + first * track[:-2]) / scale
 
 
 def geman_mcclure(squared: torch.Tensor, turn: float = 2.0) -> torch.Tensor:

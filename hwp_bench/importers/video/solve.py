@@ -10,7 +10,6 @@ import numpy as np
 import torch
 
 from hwp_bench.base.arrays import evenly
-from hwp_bench.base.console import notice
 from hwp_bench.hands import HandTemplate, load_template, pose_hand
 from hwp_bench.hands.fitting import minimize
 from hwp_bench.hands.skeleton import SIDES
@@ -79,10 +78,18 @@ class Footage:
     #: Whole frame, px.
     width: int
     height: int
-    #: Frames per second between the selected frames.
+    #: Selected frames per second.
     fps: float
     #: Focal length in px, or None to estimate it.
     focal: float | None
+    #: (F,) s, when the selected frames were recorded; None where all steps are equal.
+    times: np.ndarray | None = None
+
+    def steps(self, count: int) -> np.ndarray:
+        """Return the time between `count` frames, (F - 1,) in units of 1/30 s."""
+        if self.times is None:
+            return np.full(count - 1, 30.0 / self.fps)
+        return np.asarray(30.0 * np.diff(self.times))
 
     @property
     def centre(self) -> np.ndarray:
@@ -144,7 +151,7 @@ def fit_landmarks(
     """Fit pose, shape, place and (unless given) focal length to the landmarks of a clip."""
     model = start_model(landmarks, template, footage)
     prior = footage.first_focal if footage.focal is None else None
-    residual = LandmarkResidual(landmarks, model, footage.fps, prior)
+    residual = LandmarkResidual(landmarks, model, footage.steps(len(landmarks.score)), prior)
     hold = () if footage.focal is None else ("log_focal",)
     descend(model, residual.from_afar, settings.start_steps, hold=_CONSTANTS, tick=tick)
     descend(model, residual, settings.landmark_steps, hold=hold, tick=tick)
@@ -317,10 +324,10 @@ def side_scores(landmarks: Landmarks, hand_model: str, footage: Footage) -> Side
     return SideScores(right, left, len(chosen))
 
 
-def warn_of_contradiction(
+def contradiction(
     side: str, scores: SideScores, votes: Mapping[str, float] | None, *, stated: bool = True
-) -> bool:
-    """Warn, and say so, where a hand is imported as one of a side and the pictures show the other.
+) -> str | None:
+    """Say so where a hand is imported as one of a side and the pictures show the other.
 
     The fit decides where it is clear, else the network's votes, where the landmarks have them.
     `stated`: a person has stated the side; else it is what the votes say.
@@ -328,7 +335,7 @@ def warn_of_contradiction(
     voted = None if votes is None else max(SIDES, key=lambda side: votes[side])
     shown = scores.better if scores.is_clear else voted
     if shown is None or shown == side:
-        return False
+        return None
     voted_for = ""
     if votes is not None:
         voted_for = f"the tracker votes right {votes['right']:.2f}, left {votes['left']:.2f}"
@@ -337,9 +344,8 @@ def warn_of_contradiction(
         said = f"the hand is said to be a {side} one, but {also}"
     else:
         said = f"{voted_for} for a hand that is taken for a {side} one, but "
-    notice(
-        f"warning: {said}the hand model misses the landmarks by {1e3 * scores.right:.1f} mm as a "
-        f"right hand, {1e3 * scores.left:.1f} mm as a left one ({scores.frames} frames). With the "
-        "wrong side, palm and back are swapped. A mirrored video also looks like this."
+    return (
+        f"{said}the hand model misses the landmarks by {1e3 * scores.right:.1f} mm as a right "
+        f"hand, {1e3 * scores.left:.1f} mm as a left one ({scores.frames} frames), as in a "
+        "mirrored video; with the wrong side, palm and back are swapped"
     )
-    return True

@@ -23,9 +23,10 @@ from hwp_bench.base.console import notice, progress
 from hwp_bench.base.errors import BadInput, UsageError, has_odd_characters
 from hwp_bench.base.records import MAX_TEXT
 from hwp_bench.capture.schema import MAX_FRAMES
-from hwp_bench.hands.skeleton import LANDMARK_EDGES, SIDES
+from hwp_bench.hands.skeleton import LANDMARK_EDGES
 from hwp_bench.importers.shared.frames import CropWindows, cells, follow_hands
 from hwp_bench.importers.shared.landmarks import (
+    Association,
     Landmarks,
     check_against_video,
     read_association,
@@ -42,15 +43,16 @@ from hwp_bench.importers.video.decode import (
     read_frames,
     read_images,
     read_masks,
+    read_times,
     warn_of_damage,
     working_size,
 )
 from hwp_bench.importers.video.residuals import FIELD_SIZE
 from hwp_bench.importers.video.solve import (
     Footage,
+    SideScores,
     SolveSettings,
     side_scores,
-    warn_of_contradiction,
 )
 from hwp_bench.taxonomy import perturbation
 
@@ -91,6 +93,8 @@ class VideoImport:
     sheet: Path | None = None
     #: Replace an existing capture.
     overwrite: bool = False
+    #: Refuse a video that no useful avatar can come of, and not only warn.
+    strict: bool = False
     #: Numbers of the fit.
     fit: SolveSettings = field(default_factory=SolveSettings)
 
@@ -129,15 +133,17 @@ class VideoSource:
     indices: np.ndarray
     #: Landmarks of those frames by side, the hand that is detected most first.
     hands: Mapping[str, Landmarks]
+    #: How well each fits as a right and as a left hand.
+    scores: Mapping[str, SideScores]
     #: Where the hands are.
     windows: CropWindows
     images: ClipImages
+    #: Size and times of the frames.
+    footage: Footage
     #: (F, S, S) uint8 or None.
     own_masks: np.ndarray | None
-    #: How often the tracker had exchanged two hands, over the whole video.
-    swaps: int = 0
-    #: Number of frames in which it had put both on one hand.
-    doubles: int = 0
+    #: The hands of the whole file, where it says which side they are.
+    tracked: Association | None = None
     #: What came of reading the video to its end; None where a part was read.
     reading: Reading | None = None
 
@@ -160,14 +166,16 @@ def read_source(
     tracked = read_association(landmarks)
     every = read_sides(landmarks, options.side, tracked, min_score=options.min_score)
     # Containers may state a wrong number of frames. A whole video is counted as it is decoded.
-    # The end of a part is never read, so the header is trusted.
-    part = options.frames.stop is not None
-    count = len(next(iter(every.values())).score)
-    total = info.stated_frames if part and info.stated_frames else count
+    # The end of a part is never decoded, so its packets or the header are trusted.
+    times = read_times(info.path)
+    total = len(next(iter(every.values())).score)
+    if options.frames.stop is not None and (times is None or len(times) != total):
+        total = info.stated_frames or total
     checked = {
         side: check_against_video(hand, total, info.width, info.height, landmarks)
         for side, hand in every.items()
     }
+    times = None if times is None or len(times) != total else times
     indices = options.frames.indices(total)
     if not 3 <= len(indices) <= MAX_FRAMES:
         raise UsageError(
@@ -180,15 +188,12 @@ def read_source(
         raise UsageError("no hand is detected in the selected frames", field="--frames")
     for side in selected.keys() - seen.keys():
         notice(f"The {side} hand is in none of the selected frames and is left out.")
-    footage = Footage(info.width, info.height, info.fps / options.frames.stride, options.focal)
+    footage = _footage(info, options, indices, times)
     # The pictures are asked which hands they show, before minutes of work.
-    hands = {}
+    hands, scores = {}, {}
     for given, hand in seen.items():
-        scores = side_scores(hand, options.hand_model, footage)
-        if given is not None:
-            votes = None if tracked is None else tracked.votes(given)
-            warn_of_contradiction(given, scores, votes, stated=options.side in SIDES)
-        hands[given or scores.better] = hand
+        found = side_scores(hand, options.hand_model, footage)
+        scores[given or found.better], hands[given or found.better] = found, hand
     windows = follow_hands(list(hands.values()), footage.fps, options.size)
     _check_memory(windows)
     own = None if options.masks is None else read_masks(options.masks, info, indices, windows)
@@ -198,12 +203,36 @@ def read_source(
     reading = endings[0] if endings else None
     if reading is not None:
         warn_of_damage(info, reading)
-    repaired = (0, 0)
-    if tracked is not None and len(hands) == 2:
-        repaired = (tracked.swaps, tracked.doubles)
     return VideoSource(
-        info, Path(landmarks), indices, hands, windows, images, own, *repaired, reading
+        info,
+        Path(landmarks),
+        indices,
+        hands,
+        scores,
+        windows,
+        images,
+        footage,
+        own,
+        tracked,
+        reading,
     )
+
+
+def _footage(
+    info: VideoInfo, options: VideoImport, indices: np.ndarray, times: np.ndarray | None
+) -> Footage:
+    """The selected frames' size, and their times where `times` of all frames are known.
+
+    Clocks of containers round to a millisecond: times that are even but for that are a rate.
+    """
+    stated, size = info.fps / options.frames.stride, (info.width, info.height)
+    if times is None:
+        return Footage(*size, stated, options.focal)
+    times = np.round(times[indices] - times[indices[0]], 6)
+    rate = (len(times) - 1) / float(times[-1])
+    if np.abs(times - np.arange(len(times)) / rate).max() > 1.5e-3:
+        return Footage(*size, rate, options.focal, times)
+    return Footage(*size, stated if abs(rate / stated - 1) < 0.01 else rate, options.focal)
 
 
 def _check_memory(windows: CropWindows) -> None:

@@ -282,6 +282,17 @@ def test_it_is_h264_and_shows_the_frames_in_order(size: tuple[int, int], tmp_pat
         assert error.mean() <= 6
 
 
+def test_frames_are_shown_when_they_were_recorded(tmp_path: Path) -> None:
+    """Oracle: the stamps of the packets."""
+    import av
+
+    times = [0.0, 0.033, 0.068, 0.135, 0.4]
+    path = write_movie(tmp_path / "clip.mp4", clip(5), FPS, times)
+    with av.open(str(path)) as container:
+        found = [float(frame.pts * frame.time_base) for frame in container.decode(video=0)]
+    np.testing.assert_allclose(found, times, atol=1e-4)
+
+
 def test_what_cannot_be_written_leaves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

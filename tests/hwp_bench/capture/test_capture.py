@@ -166,6 +166,10 @@ def _edit(root: Path, **changes: object) -> None:
         ({"perturbations": {"motion_blur": [9] * 12}}, "severity 9 of frame 0"),
         ({"hand_model": {"name": "anny-1"}}, "hand_model.digest: is missing"),
         ({"source": []}, "source"),
+        ({"times": [0.0, 0.1]}, "times: must be null or 12 rising seconds, the first 0"),
+        ({"times": [0.1 * (f if f != 5 else 4) for f in range(12)]}, "times: must be null or 12"),
+        ({"times": [0.1 * (f + 1) for f in range(12)]}, "times: must be null or 12"),
+        ({"times": ["0"] * 12}, "times[0]"),
     ],
 )
 def test_damaged_metadata_is_named(
@@ -177,6 +181,20 @@ def test_damaged_metadata_is_named(
         open_capture(root)
     assert problem in str(caught.value)
     assert not check_capture(root).ok
+
+
+def test_times_are_optional_and_come_back(make_capture: CaptureMaker, tmp_path: Path) -> None:
+    """Of an even rate nothing is written, so that digests are those of versions without times."""
+    capture = make_capture(frames=4)
+    assert "times" not in json.loads((capture.root / "capture.json").read_text())
+    np.testing.assert_allclose(capture.info.frame_times(), np.arange(4) / 30)
+    times = (0.0, 0.033, 0.1, 0.135)
+    _edit(capture.root, times=times)
+    again = open_capture(capture.root)
+    assert again.info.times == times
+    np.testing.assert_array_equal(again.info.frame_times(), times)
+    assert again.info.to_json()["times"] == times
+    assert check_capture(capture.root).ok
 
 
 @pytest.mark.parametrize(

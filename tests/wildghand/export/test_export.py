@@ -33,7 +33,7 @@ from wildghand.avatar.avatar import PosedGaussians, WildGHandAvatar
 from wildghand.avatar.files import save_avatar
 from wildghand.cli.main import main
 from wildghand.export.formats import FORMATS, ExportSettings, export
-from wildghand.export.mesh import quaternions, strongest
+from wildghand.export.mesh import capture_motion, quaternions, strongest
 from wildghand.export.splats import (
     FRACTIONAL_BITS,
     SH_CONSTANT,
@@ -370,6 +370,16 @@ def test_khronos_finds_no_error_in_a_mesh(fitted, tmp_path: Path) -> None:
     avatar, capture = fitted
     export(avatar, tmp_path / "hand.glb", ExportSettings(mesh=True, texture=256), capture=capture)
     assert validation_errors(tmp_path / "hand.glb") == []
+
+
+def test_a_motion_has_the_times_of_its_frames(fitted) -> None:
+    avatar, capture = fitted
+    times = np.cumsum(np.resize([0.033, 0.067, 0.035], len(capture))) - 0.033
+    info = replace(capture.info, times=tuple(times))
+    uneven = Capture(capture.root, info, capture.hands, capture.cameras)
+    kept = np.flatnonzero(capture.hands["right"].valid)
+    motion = capture_motion(avatar, uneven, ("right",))
+    np.testing.assert_allclose(motion.times, times[kept] - times[kept[0]])
 
 
 def test_quaternions_do_not_jump_and_weights_sum_to_one() -> None:

@@ -7,6 +7,7 @@ before it was written.
 from __future__ import annotations
 
 import itertools
+import json
 import shutil
 from collections.abc import Callable
 from dataclasses import asdict, replace
@@ -24,6 +25,7 @@ from hwp_bench.base.errors import BadInput, DidNotConverge, UsageError
 from hwp_bench.base.images import read_rgb
 from hwp_bench.base.records import flattened
 from hwp_bench.capture import Capture
+from hwp_bench.importers.video.decode import read_times
 from hwp_bench.methods import find_method, read_manifest
 from hwp_bench.methods.contract import Budget, TrainingCapture
 from wildghand.avatar.avatar import WildGHandAvatar
@@ -284,8 +286,15 @@ def test_the_commands_make_draw_and_export_an_avatar(
     assert "5 steps" in shown.out
     assert (avatar / "model.safetensors").stat().st_mtime_ns == before
     pictures = tmp_path / "pictures"
-    words = ["render", str(avatar), "--poses", str(capture), "-o", str(pictures)]
+    # Of a clip of uneven steps the video has its times.
+    clip = Path(shutil.copytree(capture, tmp_path / "clip"))
+    written = json.loads((clip / "capture.json").read_text())
+    uneven = [0.05 * frame + 0.01 * (frame % 2) for frame in range(written["frame_count"])]
+    (clip / "capture.json").write_text(json.dumps({**written, "times": uneven}))
+    words = ["render", str(avatar), "--poses", str(clip), "-o", str(pictures)]
     assert main([*words, "--frames", "2:5", "--video", str(tmp_path / "clip.mp4")]) == 0
+    shown = read_times(tmp_path / "clip.mp4")
+    np.testing.assert_allclose(shown, np.array(uneven[2:5]) - uneven[2], atol=1e-3)
     assert sorted(path.name for path in pictures.iterdir()) == [f"{f:06d}.png" for f in (2, 3, 4)]
     assert read_rgb(pictures / "000002.png").max() > 0
     assert (tmp_path / "clip.mp4").stat().st_size > 0

@@ -13,6 +13,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -23,14 +24,14 @@ from synthetic_clip import landmark_import, make_clip, write_landmarks, write_vi
 from two_hand_clip import make_two_hands, write_two_hands
 
 import wildghand
-from hwp_bench.base.errors import BadInput, UsageError
+from hwp_bench.base.errors import BadInput, MissingDependency, UsageError
 from hwp_bench.base.images import read_rgb
 from hwp_bench.capture import open_capture
 from hwp_bench.importers.shared.landmarks import read_hand_tracks, write_hand_tracks
-from hwp_bench.tracking.networks import HAND, PALM, models_folder
+from hwp_bench.tracking.networks import HAND, PALM, HandModels, models_folder
 from wildghand.avatar.files import load_avatar
 from wildghand.cli.main import main
-from wildghand.from_video import VideoFit, make_avatar, stages
+from wildghand.from_video import VideoFit, make, make_avatar, stages
 from wildghand.from_video.run import QUICK as QUICK_CHANGES
 from wildghand.from_video.run import QUICK_FRAMES, VideoJob, with_quick
 from wildghand.from_video.stages import STAGES, import_options, stride
@@ -245,9 +246,15 @@ def test_the_command(folder: Path, capsys, monkeypatch: pytest.MonkeyPatch) -> N
     assert facts["video"]["codec"] == "mjpeg"
     for name in ("avatar", "turntable", "sheet", "capture"):
         assert Path(facts[name]).exists()
+    # The palm is all that the clip shows.
+    verdict = facts["verdict"]
+    assert verdict["film_next"][0].startswith("the back was never seen: turn the hand over")
+    assert verdict["pose_error_px"] == {"right": pytest.approx(1.0, abs=1.0)}
     assert main([*words, "-o", str(folder / "my_hand")]) == 0
     said = capsys.readouterr().out
     assert "turntable: " in said
+    assert "verdict: " in said
+    assert "film next: the back was never seen: turn the hand over for three seconds" in said
     assert "video: " not in said
     # What the import took down is said by later runs too, and stands on the sheet.
     capture = folder / "my_hand" / "work" / "capture"
@@ -263,6 +270,8 @@ def test_the_command(folder: Path, capsys, monkeypatch: pytest.MonkeyPatch) -> N
     assert main([*words, "-o", str(folder / "my_hand")]) == 0
     assert "video: ends early, after 12 of 24" in capsys.readouterr().out
     assert sum("(video ends early)" in label for label in labels) == 1
+    assert any(label.startswith("verdict: ") for label in labels)
+    assert any(label.startswith("film next: the back") for label in labels)
 
 
 def test_from_python(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -340,8 +349,42 @@ def test_too_few_frames_with_a_hand(folder: Path) -> None:
     clip = make_clip(COUNT)
     score = np.where(np.arange(COUNT) < 5, 0.9, 0.0)
     write_landmarks(folder / "hand.npz", clip.landmarks, score=score)
-    with pytest.raises(BadInput, match="shows a hand in 5 of 16 frames"):
+    with pytest.raises(BadInput, match="shows a hand in 5 of 16 frames") as caught:
         make_avatar(folder / "hand.avi", folder / "other", choices(folder))
+    shown = folder / "other" / "work" / "tracked.jpg"
+    assert str(shown) in str(caught.value)
+    assert shown.is_file()
+
+
+def test_a_video_of_no_use_is_refused_before_its_import(folder: Path, capsys) -> None:
+    """The command says so in one line, and names the sheet."""
+    clip = make_clip(COUNT)
+    write_video(folder / "dark.avi", [clip.picture(frame) // 16 for frame in range(COUNT)])
+    words = ["fit", str(folder / "dark.avi"), "--landmarks", str(folder / "hand.npz")]
+    assert main([*words, "-o", str(folder / "other")]) == 1
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert "no useful avatar can come of this video: the right hand is underexposed in 16" in error
+    assert (folder / "other" / "work" / "capture_tracked.jpg").is_file()
+    assert not (folder / "other" / "work" / "capture").exists()
+
+
+def test_what_a_job_needs_is_checked_before_its_folder_is_made(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place, given = folder / "other", choices(folder)
+    for name, full in (
+        ("shutil.disk_usage", lambda path: SimpleNamespace(free=50_000_000)),
+        ("psutil.virtual_memory", lambda: SimpleNamespace(available=400_000_000)),
+    ):
+        with monkeypatch.context() as here:
+            here.setattr(name, full)
+            with pytest.raises(UsageError, match=r"16 frames need about \d\.\d GB of (disk|mem)"):
+                make_avatar(folder / "hand.avi", place, given)
+    monkeypatch.setitem(sys.modules, "ai_edge_litert.interpreter", None)
+    monkeypatch.setattr(make, "load_models", lambda model: HandModels(b"", b"", "none"))
+    with pytest.raises(MissingDependency, match=r"pip install 'hwp-bench\[track\]'|hand tracker"):
+        make_avatar(folder / "hand.avi", place, replace(given, landmarks=None))
+    assert not place.exists()
 
 
 def test_without_the_tracker_or_the_network_one_line_says_so(
@@ -359,6 +402,7 @@ def test_without_the_tracker_or_the_network_one_line_says_so(
         told = capsys.readouterr().err
         assert "cannot be downloaded (network is unreachable)" in told
         assert "hwp-bench data track --fetch" in told
+        assert not (folder / "other").exists()
     if not all((models_folder() / name).is_file() for name in (PALM, HAND)):
         pytest.skip("the networks are not in the cache: hwp-bench data track --fetch")
     monkeypatch.setitem(sys.modules, "ai_edge_litert.interpreter", None)
@@ -373,6 +417,7 @@ def test_a_video_without_a_hand(tmp_path: Path, capsys) -> None:
     assert main(["fit", str(tmp_path / "wall.avi")]) == 1
     told = capsys.readouterr().err
     assert "none of 3 frames shows a hand" in told
+    assert (tmp_path / "wall_avatar" / "work" / "landmarks.jpg").is_file()
     assert "--landmarks" in told
 
 

@@ -210,7 +210,7 @@ def test_a_motion_plays_round_and_stops() -> None:
         if len(set(shown)) == 4 and len(shown) > 8:
             enough.set()
 
-    player = Player(4, 200.0, show)
+    player = Player(np.array([0.0, 0.005, 0.015, 0.02]), show)
     player.play(2)
     player.play(0)  # it plays already
     assert enough.wait(60.0)

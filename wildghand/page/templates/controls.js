@@ -176,9 +176,13 @@ function start() {
   }
   function play(on) {
     state.playing = on;
-    clearInterval(timer);
+    clearTimeout(timer);
     one("play").textContent = on ? "Pause" : "Play";
-    if (on) timer = setInterval(() => setFrame((state.frame + 1) % frames), 1000 / content.fps);
+    const show = () => {
+      const next = () => { setFrame((state.frame + 1) % frames); show(); };
+      timer = setTimeout(next, 1000 * content.shown[state.frame]);
+    };
+    if (on) show();
   }
   if (frames) {
     one("time").max = frames - 1;

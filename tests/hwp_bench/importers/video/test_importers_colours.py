@@ -120,6 +120,15 @@ def samples_of(signal: np.ndarray, matrix: int, *, full: bool, bits: int) -> lis
     return [np.clip(np.round(value), 0, most).astype(kind) for value in values]
 
 
+#: The finest that encoders have which always lose something.
+OPTIONS = {
+    "libvpx": {"crf": "4", "qmin": "0", "qmax": "4", "b": "40M"},
+    "libvpx-vp9": {"lossless": "1"},
+    "libsvtav1": {"preset": "8", "crf": "1", "svtav1-params": "lp=1"},
+    "prores_ks": {"profile": "4", "qscale": "1"},
+}
+
+
 def colours() -> np.ndarray:
     """Signals (48, 3): skin, greys from black to white, primaries, and some of all kinds."""
     rng = np.random.default_rng(3)
@@ -132,11 +141,13 @@ def colours() -> np.ndarray:
 def write_patches(
     path: Path, planes: Sequence[np.ndarray], pix_fmt: str, codec: str, marks: dict[str, int]
 ) -> Path:
-    """One frame of patches, 4:2:0 or 4:4:4."""
+    """One frame of patches, 4:2:0, 4:2:2 or 4:4:4."""
     whole = [np.kron(p.reshape(ROWS, COLUMNS), np.ones((PATCH, PATCH), p.dtype)) for p in planes]
     if "420" in pix_fmt:
         whole[1:] = [plane[::2, ::2] for plane in whole[1:]]
-    return write_samples(path, [whole], pix_fmt, codec, marks=marks)
+    if "422" in pix_fmt:
+        whole[1:] = [plane[:, ::2] for plane in whole[1:]]
+    return write_samples(path, [whole], pix_fmt, codec, marks=marks, options=OPTIONS.get(codec))
 
 
 def read_patches(path: Path) -> np.ndarray:
@@ -180,6 +191,49 @@ def test_hdr(tmp_path: Path, marks, displays, codec: str, ending: str, full: boo
     truth = displays(signal_of(planes, 9, full=full, bits=10)) * 255
     assert np.abs(read_patches(path) - truth).max() <= ROUNDED
     assert ("HLG" if marks["color_trc"] == 18 else "PQ") in probe(path).colours
+
+
+@pytest.mark.parametrize(
+    ("codec", "ending", "pix_fmt", "matrix", "lost"),
+    [
+        ("libvpx", "webm", "yuv420p", 6, 3.0),
+        ("libvpx-vp9", "webm", "yuv420p", 1, 0.0),
+        ("libsvtav1", "mp4", "yuv420p10le", 9, 2.0),
+        ("prores_ks", "mov", "yuv422p10le", 9, 2.0),
+    ],
+)
+def test_codecs_keep_their_colours(
+    tmp_path: Path, codec: str, ending: str, pix_fmt: str, matrix: int, lost: float
+) -> None:
+    """Ordinary video in 8 bits, HLG in 10; `lost`: levels that the encoder may take."""
+    bits = 10 if "10" in pix_fmt else 8
+    marks = HLG if bits == 10 else {"colorspace": matrix, "color_range": 1}
+    planes = samples_of(np.clip(colours(), 0, 1), matrix, full=False, bits=bits)
+    path = write_patches(tmp_path / f"a.{ending}", planes, pix_fmt, codec, marks)
+    signal = signal_of(planes, matrix, full=False, bits=bits)
+    truth = (hlg_displayed(signal) if bits == 10 else np.clip(signal, 0, 1)) * 255
+    exact = ROUNDED if bits == 10 else FAST
+    assert np.abs(read_patches(path) - truth).max() <= exact + lost
+
+
+@pytest.mark.parametrize(
+    ("pix_fmt", "bits", "tolerance"), [("yuv420p", 8, FAST), ("yuv420p10le", 10, ROUNDED)]
+)
+def test_odd_sizes_keep_their_colours(
+    tmp_path: Path, pix_fmt: str, bits: int, tolerance: float
+) -> None:
+    """Also in the last row and column, whose colour is half of a sample."""
+    marks = HLG if bits == 10 else {"colorspace": 6, "color_range": 1}
+    matrix, height, width = marks["colorspace"], 47, 63
+    one = samples_of(np.array([[0.62, 0.47, 0.4]]), matrix, full=False, bits=bits)
+    planes = [np.full((height, width), one[0][0])]
+    planes += [np.full((24, 32), sample[0]) for sample in one[1:]]
+    path = write_samples(tmp_path / "a.mkv", [planes], pix_fmt, "ffv1", marks=marks)
+    [(_, image)] = read_frames(probe(path), FrameRange())
+    signal = signal_of(one, matrix, full=False, bits=bits)
+    truth = (hlg_displayed(signal) if bits == 10 else np.clip(signal, 0, 1))[0] * 255
+    assert image.shape == (height, width, 3)
+    assert np.abs(image - truth).max() <= tolerance
 
 
 def test_levels_of_hdr_are_those_of_the_recommendation() -> None:

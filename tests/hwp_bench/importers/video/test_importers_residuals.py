@@ -14,11 +14,26 @@ from hwp_bench.importers.video.model import ClipModel, RigidStart
 from hwp_bench.importers.video.residuals import (
     FIELD_SIZE,
     ContactResidual,
+    acceleration,
     match_outline,
     signed_distance,
     template_spheres,
     touching_pairs,
 )
+
+
+def test_acceleration_knows_the_time_between_frames() -> None:
+    """Of a parabola it is the same everywhere, whatever the steps; of a line it is 0."""
+    steps = np.array([1.0, 1.05, 2.0, 1.0, 0.5, 3.0])
+    time = np.cumsum([0.0, *steps])
+    bend, slope = np.array([0.3, -0.2]), np.array([2.0, 5.0])
+    track = torch.as_tensor(0.5 * np.outer(time**2, bend) + np.outer(time, slope) + 1.0)
+    found = acceleration(track, steps, 0.1).numpy()
+    np.testing.assert_allclose(found, np.tile(bend / 0.1, (5, 1)), atol=1e-12)
+    # Of even steps it is, to the bit, the second difference.
+    even = track.float()
+    expected = (even[2:] - 2.0 * even[1:-1] + even[:-2]) / (0.1 * (30.0 / 24.0) ** 2)
+    assert torch.equal(acceleration(even, np.full(6, 30.0 / 24.0), 0.1), expected)
 
 
 def disc_mask(centre: np.ndarray, radius: float, size: int = FIELD_SIZE) -> np.ndarray:

@@ -20,7 +20,14 @@ from encoded_video import pictures, silence, write_pictures
 from hwp_bench.base.errors import BadInput
 from hwp_bench.base.images import read_gray
 from hwp_bench.cli.main import main
-from hwp_bench.importers.video.decode import FrameRange, Reading, VideoInfo, probe, read_frames
+from hwp_bench.importers.video.decode import (
+    FrameRange,
+    Reading,
+    VideoInfo,
+    probe,
+    read_frames,
+    read_times,
+)
 
 COUNT = 24
 #: H.264 whose frames stand alone, so that each that is in the file can be shown.
@@ -50,7 +57,7 @@ def cut(path: Path, share: float = 0.6) -> Path:
 @pytest.mark.parametrize(
     ("codec", "ending"),
     [("libsvtav1", "mp4"), ("libsvtav1", "mkv"), ("libx265", "mov"), ("libvpx-vp9", "webm"),
-     ("prores_ks", "mov"), ("ffv1", "mkv")],
+     ("libvpx", "webm"), ("prores_ks", "mov"), ("ffv1", "mkv")],
 )  # fmt: skip
 def test_codecs_of_phones_and_browsers(tmp_path: Path, codec: str, ending: str) -> None:
     options = {"libsvtav1": {"preset": "11", "svtav1-params": "lp=1"},
@@ -240,6 +247,44 @@ def test_odd_sizes_and_steps_of_time(tmp_path: Path) -> None:
     assert (info.width, info.height) == (63, 47)
     np.testing.assert_array_equal(frames, images)
     assert reading.warning() is None
+
+
+#: ms between frames, as phones have them: most of 30 a second, some dropped, some late.
+STEPS = [33, 34, 33, 67, 33, 35, 100, 33] * 3
+
+
+@pytest.mark.parametrize(
+    ("ending", "codec"),
+    [("mp4", "libx264"), ("mov", "libx265"), ("mkv", "libx264"), ("webm", "libvpx-vp9"),
+     ("ts", "libx264"), ("flv", "libx264")],
+)  # fmt: skip
+def test_times_of_frames_are_read(tmp_path: Path, ending: str, codec: str) -> None:
+    """Also where frames are stored in another order. Tolerance: a tick of the container's clock."""
+    times = np.cumsum([40, *STEPS[: COUNT - 1]])
+    quiet = {"x265-params": "log-level=none"} if codec == "libx265" else {}
+    path = write_pictures(
+        tmp_path / f"a.{ending}", pictures(COUNT), codec, options=quiet, times=times.tolist()
+    )
+    found = read_times(path)
+    assert found is not None
+    np.testing.assert_allclose(found, (times - times[0]) / 1000, atol=1e-3)
+    assert len(found) == len(read(path)[1])
+
+
+def test_a_video_without_a_clock_has_no_times(tmp_path: Path) -> None:
+    raw = write_pictures(tmp_path / "a.mpg", pictures(COUNT), "mpeg1video")
+    import av
+
+    with av.open(str(raw)) as container:
+        content = b"".join(bytes(packet) for packet in container.demux(video=0))
+    (tmp_path / "raw.m1v").write_bytes(content)
+    assert read_times(tmp_path / "raw.m1v") is None
+    whole = write_pictures(tmp_path / "a.mp4", pictures(COUNT))
+    assert read_times(patched(whole, b"mdhd", 12, bytes(4))) is None
+    doubled = write_pictures(
+        tmp_path / "b.mkv", pictures(3), "ffv1", pix_fmt="bgr0", times=[0, 40, 40]
+    )
+    assert read_times(doubled) is None
 
 
 @pytest.mark.parametrize(

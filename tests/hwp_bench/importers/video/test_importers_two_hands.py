@@ -72,7 +72,7 @@ def test_swaps_are_repaired_before_the_fit(folder: Path, clip: TwoHandClip) -> N
 
 @pytest.mark.slow
 def test_both_hands_lie_on_the_true_ones(imported: ImportedClip, clip: TwoHandClip) -> None:
-    assert imported.source.swaps == len(SWAPS)
+    assert imported.facts()["swaps_repaired"] == len(SWAPS)
     assert imported.shown == "both"
     for side, true in clip.hands.items():
         hand = imported.hands[side]

@@ -100,6 +100,32 @@ def test_the_capture_is_sound(capture: Capture, clip: SyntheticClip) -> None:
     assert read_rgb(capture.root / "extra" / "overlay.png").shape[2] == 3
 
 
+def test_times_of_frames_are_kept(folder: Path, clip: SyntheticClip, tmp_path: Path) -> None:
+    """A phone's steps reach the capture and the fit; even ones but for rounding are a rate."""
+    images = [clip.picture(frame) for frame in range(FRAMES)]
+    times = np.cumsum([0, *([33, 33, 67, 35, 33] * 3)])
+    write_pictures(tmp_path / "hand.mkv", images, "mjpeg", pix_fmt="yuvj420p", times=times.tolist())
+    options = VideoImport(size=128, fit=HASTY, focal=FOCAL, frames=FrameRange(1, 15, 2))
+    imported = import_video(tmp_path / "hand.mkv", folder / "hand.npz", tmp_path / "c", options)
+    info = open_capture(tmp_path / "c").info
+    kept = (times[1:15:2] - times[1]) / 1000
+    np.testing.assert_allclose(info.frame_times(), kept, atol=1e-9)
+    assert info.fps == pytest.approx(6 / kept[-1])
+    assert check_capture(tmp_path / "c").ok
+    fitted = imported.first.fitted.landmarks
+    np.testing.assert_allclose(fitted.steps, 30 * np.diff(kept))
+    even = [round(1000 * frame / 30) for frame in range(FRAMES)]
+    write_pictures(tmp_path / "even.mkv", images, "mjpeg", pix_fmt="yuvj420p", times=even)
+    source = read_source(tmp_path / "even.mkv", folder / "hand.npz", options)
+    assert (source.footage.times, source.footage.fps) == (None, 15.0)
+    # Browsers' recordings may state a rate of 1000.
+    slow = [100 * frame for frame in range(FRAMES)]
+    write_pictures(tmp_path / "slow.mkv", images, "mjpeg", pix_fmt="yuvj420p", times=slow)
+    source = read_source(tmp_path / "slow.mkv", folder / "hand.npz", options)
+    assert source.footage.times is None
+    assert source.footage.fps == pytest.approx(5.0)
+
+
 def test_the_stored_hand_lies_on_the_true_hand(capture: Capture, clip: SyntheticClip) -> None:
     # Through the capture's own cameras, against the truth moved to the crop: 2 px of 128.
     hand = capture.hands["right"]
