@@ -1,4 +1,4 @@
-"""What a page holds of a hand: its surface, its Gaussians, and what of the model sees a pose.
+"""Content of a page: a hand's surface, its Gaussians, and the layers of the model that see a pose.
 
 Most of a compact network sees no pose: for each Gaussian it comes down to 14 numbers. What does
 see the pose (the geometry branch and what the heads make of it) is a few small layers, which the
