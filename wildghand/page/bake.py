@@ -19,9 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from hwp_bench.base.arrays import evenly
 from hwp_bench.hands.articulation import axis_angle_to_matrix
-from hwp_bench.methods.contract import HandPose
 from wildghand.avatar import WildGHandAvatar
 from wildghand.gaussians.attributes import CHANNELS, RawAttributes
 from wildghand.model.wrist import DEPTH, OPAQUE, SPACING, THIN, WIDE, WristWall
@@ -38,8 +36,8 @@ _RIDGES, _FOLDS = (1e-3, 1e-2, 1e-1, 1.0), 4
 _HARMONICS, _MOST_WEIGHTS = 16, 2048
 # Components of a hand model's pose correctives that are kept, their bytes, and joints of a vertex.
 _CORRECTIVES, _MOST_CORRECTIVES, _JOINTS = 32, 1_000_000, 4
-# Poses that are asked for together, and in how many the wall's colour is compared.
-_CHUNK, _LOOKED_AT = 8, 6
+# Poses that are asked for together.
+_CHUNK = 8
 
 
 def pack(array: np.ndarray) -> str:
@@ -183,9 +181,7 @@ def hand_content(
     coded = chart.coordinates.double().cpu().numpy()
     # uv, and the angle of the lowest frequency of each coordinate (`encode_positions`).
     places = np.concatenate([coded[:, :2], np.arctan2(coded[:, 2:11:3], coded[:, 11:20:3])], axis=1)
-    source = None
     if wall is not None:
-        source = _like_wall(avatar, side, wall, poses)
         discs = _wall_rows(wall, len(rest), network.activation.log_scale_bias)
         corners = np.concatenate([corners, discs.corners])
         mix = np.concatenate([mix, discs.mix])
@@ -206,7 +202,7 @@ def hand_content(
         "faces": pack(faces.astype("<u4")),
         "correctives": pack_correctives(template.pose_basis),
         "border": [] if wall is None else wall.border.tolist(),
-        "source": source,
+        "lenders": [] if wall is None else wall.skin.tolist(),
         "corners": pack(corners.astype("<u2")),
         "mix": pack(np.rint(mix[:, :2] * 65535.0).astype("<u2")),
         "base": pack_whole(base),
@@ -260,17 +256,6 @@ def _disc(avatar: WildGHandAvatar, side: str) -> list[float]:
     blank = RawAttributes.split(torch.zeros(1, CHANNELS))
     bias = avatar.model.network.activation.log_scale_bias
     return Visibility(none, none).settle(side, blank, rig.spacing, bias).concatenate()[0].tolist()
-
-
-def _like_wall(avatar: WildGHandAvatar, side: str, wall: WristWall, poses: np.ndarray) -> int:
-    """The Gaussian of the skin whose colour is nearest to the wall's, which is their median."""
-    skin = wall.skin.cpu().numpy()
-    off = np.zeros(len(skin))
-    for pick in evenly(len(poses), _LOOKED_AT):
-        hand = HandPose(side, poses[pick], avatar.betas[side], np.zeros(3))
-        colors = avatar.pose({side: hand}, closed=True).colors
-        off += np.square(colors[skin] - colors[-1]).sum(axis=1)
-    return int(skin[off.argmin()])
 
 
 @dataclass(frozen=True, eq=False)

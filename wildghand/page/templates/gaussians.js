@@ -42,13 +42,13 @@ void main() {
   }
   dark = vec4(pow(clamp(lit / whole, 0.15, 1.0), 1.0 / 2.2));
 }`;
-// Texels of a Gaussian: 0 corners and the first share; 1 second share, whose colour it has, what is
-// kept of offset and shape; 2 to 5 attributes and uv; 6 place and mean weight; 7 shift, whether seen.
+// Texels of a Gaussian: 0 corners and the first share; 1 second share, unused, what is kept
+// of offset and shape; 2 to 5 attributes and uv; 6 place and mean weight; 7 shift, whether seen.
 const POSE = (P, H, first, second) => `${GLSL}
 layout(std140) uniform First { vec4 one[${first}]; };
 layout(std140) uniform Second { vec4 two[${second}]; };
 vec4 weight(int i) { return i < ${first} ? one[i] : two[i - ${first}]; }
-uniform int start; uniform bool networked, biased; uniform vec4 posture[${P}];
+uniform int start, skin; uniform bool networked, biased; uniform vec4 posture[${P}];
 uniform vec4 disc[4], activation;
 uniform ivec2 lamps; uniform vec2 ambient; uniform vec4 cap; uniform vec3 eye;
 uniform vec4 mixing[56], shift[4], fields[32]; uniform vec3 gain;
@@ -183,16 +183,20 @@ vec3 ramp(float share) {
 }
 void main() {
   int row = start + gl_VertexID, t = 8 * row;
-  vec4 first = texel(gaussians, t + 1), info = texel(gaussians, t + 7);
-  int source = int(first.y);
-  Place own = place(row), like = own;
-  if (source != row) like = place(source);
-  askLit(source, like.normal);
-  carryOn(source, like);
-  settle(source == row ? first.zw : texel(gaussians, 8 * source + 1).zw);
-  if (biased) perturb(source);
-  vec3 color = shadow * like.dark * gain / (1.0 + exp(-vec3(raw[2].w, raw[3].xy)));
-  if (source != row) for (int i = 0; i < 4; i++) raw[i] = texel(gaussians, t + 2 + i);
+  vec4 info = texel(gaussians, t + 7);
+  Place own = place(row);
+  // The discs in a wrist are as they are.
+  bool wall = gl_VertexID >= skin;
+  if (wall) {
+    for (int i = 0; i < 4; i++) raw[i] = texel(gaussians, t + 2 + i);
+    shadow = 1.0;
+  } else {
+    askLit(row, own.normal);
+    carryOn(row, own);
+    settle(texel(gaussians, t + 1).zw);
+    if (biased) perturb(row);
+  }
+  vec3 color = shadow * own.dark * gain / (1.0 + exp(-vec3(raw[2].w, raw[3].xy)));
   if (extra.w > 0.0)
     color *= 1.0 - extra.w + extra.w * (0.35 + 1.1 * max(0.0, dot(own.normal, extra.xyz)));
   float weight = texel(gaussians, t + 6).w;
@@ -314,7 +318,7 @@ class Gaussians {
         const skin = n < hand.skin, k = kept[2 * n] / 255;
         for (let i = 0; i < 3; i++) out[o + i] = corners[3 * n + i] + vertex;
         const shares = [mix[2 * n] / 65535, mix[2 * n + 1] / 65535];
-        out.set([...shares, (skin ? n : data.source) + row, k, kept[2 * n + 1] / 255], o + 3);
+        out.set([...shares, 0, k, kept[2 * n + 1] / 255], o + 3);
         out.set(base.subarray(14 * n, 14 * n + 14), o + 8);
         if (skin) out.set(places.subarray(5 * n, 5 * n + 5), o + 22);
         // Of frames f and their half h a fit keeps k = f / (f + h); it has seen f / h.
@@ -391,11 +395,17 @@ class Gaussians {
     this.upload(this.textures.vertices, this.surface);
     if (this.lamps[0]) this.castShadows();
     this.hands.forEach((hand, i) => this.poseHand(hand, poses[i], look));
-    this.copy(this.made, this.textures.made);
-    // They are sorted here.
+    // They are sorted here, and the discs in a wrist get the median colour of the skin around it.
     gl.bindBuffer(gl.COPY_READ_BUFFER, this.made);
     gl.getBufferSubData(gl.COPY_READ_BUFFER, 0, this.data);
     gl.bindBuffer(gl.COPY_READ_BUFFER, null);
+    for (const { first, skin, count, data } of this.hands)
+      for (let c = 12; c < 15 && look.shown !== "weights" && data.lenders.length; c++) {
+        const found = Float32Array.from(data.lenders, (n) => this.data[16 * (first + n) + c]).sort();
+        const median = found[(found.length - 1) >> 1];
+        for (let n = first + skin; n < first + count; n++) this.data[16 * n + c] = median;
+      }
+    this.upload(this.textures.made, this.data);
   }
   poseHand(hand, pose, look) {
     const gl = this.gl, { network, light } = this.content;
@@ -404,6 +414,7 @@ class Gaussians {
     if (biased) this.prepareBiases(hand);
     const at = this.use(this.poser, ["gaussians", "vertices", "lights", "darks", "bones"]);
     gl.uniform1i(at("start"), hand.first);
+    gl.uniform1i(at("skin"), hand.skin);
     gl.uniform1i(at("networked"), network ? 1 : 0);
     if (network) gl.uniform4fv(at("posture"), this.postureOf(pose.vectors));
     gl.uniform4fv(at("disc"), [...hand.data.disc, 0, 0]);
