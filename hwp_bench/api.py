@@ -33,7 +33,8 @@ from hwp_bench.report.tables import HEADLINE
 from hwp_bench.results import Results, read_all
 from hwp_bench.run.engine import Engine, LocalEngine
 from hwp_bench.run.engine.processes import ParallelEngine
-from hwp_bench.sim.produce.capture import ensure_suite, suite_names
+from hwp_bench.suites.suite import ensure_suite
+from hwp_bench.taxonomy import SUITES
 
 #: A capture, its folder, or the name of a suite; `evaluate` takes one or several.
 Captures: TypeAlias = (
@@ -62,8 +63,8 @@ def evaluate(
 
     Args:
         method: method directory, or the name of one that ships: `plain`, `wildghand`.
-        captures: a suite (`smoke`, `mini`, `full`, `wild-dev`, `persistent`; rendered on first
-            use), a capture or its folder, or a list of these.
+        captures: a suite (`smoke`, `mini`, `full`, `wild-dev`, `persistent`, `real-1`; rendered
+            or imported on first use), a capture or its folder, or a list of these.
         out: results folder; `runs/METHOD-SUITE` if None, with the oracle's name, the budget and
             a seed other than 0 behind it.
         preset: preset of the method; the suite's, else `default`, if None.
@@ -89,7 +90,7 @@ def evaluate(
         HwpError: another evaluation is writing to `out`, or `out` cannot be written.
     """
     method = os.fspath(place(method, "method"))
-    suite = captures if isinstance(captures, str) and captures in suite_names() else "captures"
+    suite = captures if isinstance(captures, str) and captures in SUITES else "captures"
     given = _folders(captures) if suite == "captures" else []
     of_type(preset, (str, type(None)), "preset", "a text")
     of_type(settings, (Mapping, type(None)), "settings", "a table of settings by name")

@@ -143,17 +143,21 @@ def catalogue() -> Mapping[str, CatalogueEntry]:
     return _BY_ID
 
 
-#: The suites: those of the paper's captures, smallest first (`full-lite` has a twelfth of the
-#: frames of `full`); then scenes as wide as the world,
+#: The simulated suites: those of the paper's captures, smallest first (`full-lite` has a twelfth of
+#: the frames of `full`); then scenes as wide as the world,
 #: for tuning (`wild-dev`) and for reports only (`wild-test`); then scenes whose perturbations last,
 #: with 10 % of the training frames clean (`persistent`) and with other shares in percent.
-SUITES = (
+SIMULATED_SUITES = (
     *("smoke", "mini", "full-lite", "full", "wild-dev", "wild-test", "persistent"),
     *("persistent-clean0", "persistent-clean20", "persistent-clean35", "persistent-clean60"),
 )
+#: The suites of real clips, for reports only.
+REAL_SUITES = ("real-1",)
+#: Every suite.
+SUITES = (*SIMULATED_SUITES, *REAL_SUITES)
 #: Suites whose captures have the frames and the size of another one: the preset that a method
 #: has for that one fits them too.
 SIZED_LIKE: Mapping[str, str] = MappingProxyType(
     {"full-lite": "full"}
-    | {name: "mini" for name in SUITES if name.startswith(("wild-", "persistent"))}
+    | {name: "mini" for name in SUITES if name.startswith(("wild-", "persistent", "real-"))}
 )

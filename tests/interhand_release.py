@@ -19,9 +19,8 @@ FRAMES = (7, 10, 13, 16, 19, 22, 25, 28, 31, 34, 37, 40)
 FOCAL, CENTRE = (1270.0, 1268.0), (170.0, 250.0)
 
 
-def camera() -> tuple[np.ndarray, np.ndarray]:
+def camera(angle: float = 0.3) -> tuple[np.ndarray, np.ndarray]:
     """A camera that looks at the origin from 1 m: rotation, position in mm."""
-    angle = 0.3
     rotation = np.array(
         [
             [np.cos(angle), 0, -np.sin(angle)],
@@ -32,9 +31,9 @@ def camera() -> tuple[np.ndarray, np.ndarray]:
     return rotation, -rotation.T @ np.array([0.0, 0.0, 1000.0])
 
 
-def project(points: np.ndarray) -> np.ndarray:
+def project(points: np.ndarray, angle: float = 0.3) -> np.ndarray:
     """(N, 2) px of world points in metres, by the data set's own formula."""
-    rotation, position = camera()
+    rotation, position = camera(angle)
     local = (points * 1000.0 - position) @ rotation.T
     return local[:, :2] / local[:, 2:] * FOCAL + CENTRE
 
@@ -47,6 +46,7 @@ def write_interhand(
     capture: int = 21,
     cam: str = "400015",
     split: str = "test",
+    angle: float = 0.3,
 ) -> dict[str, np.ndarray]:
     """Write images and annotations; returns the true vertices (F, 778, 3) by side, m, world."""
     rng = np.random.default_rng(3)
@@ -55,7 +55,7 @@ def write_interhand(
     truth: dict[str, list] = {side: [] for side in templates}
     fingers = {side: rng.normal(0, 0.08, 45) for side in templates}
     shape = {side: rng.normal(0, 0.5, 10) for side in templates}
-    rotation, position = camera()
+    rotation, position = camera(angle)
     for index, frame in enumerate(FRAMES):
         picture = rng.integers(0, 40, (HEIGHT, WIDTH, 3)).astype(np.uint8)
         world, valid = np.ones((42, 3)), np.zeros((42, 1))
@@ -76,7 +76,7 @@ def write_interhand(
             truth[side].append(vertices)
             if not present:
                 continue
-            hand = draw_silhouette(project(vertices), template.faces, HEIGHT)[:, :WIDTH] > 0
+            hand = draw_silhouette(project(vertices, angle), template.faces, HEIGHT)[:, :WIDTH] > 0
             picture[hand] = (200, 150, 120)
             first = 0 if side == "right" else 21
             rows = first + np.array(LANDMARK_ROWS)

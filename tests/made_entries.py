@@ -12,10 +12,10 @@ from hwp_bench.capture.splits import split_for
 from hwp_bench.evaluation.capture_evaluation import key_of
 from hwp_bench.leaderboard.entries import Check, Entry
 from hwp_bench.leaderboard.site import board_page, shown_rows
-from hwp_bench.leaderboard.suite_data import read_suite_data
+from hwp_bench.leaderboard.suite_data import read_suite_data, suite_origins
 from hwp_bench.metrics import PROTOCOLS, metric_names
 from hwp_bench.results import FrameResult, Results
-from hwp_bench.sim.produce.capture import suite
+from hwp_bench.suites.suite import suite
 
 #: Scores of the metrics that tests say nothing about.
 OTHER_SCORES = dict.fromkeys(metric_names(), 0.5)
@@ -38,9 +38,10 @@ def complete_results(
     """
     base = results_example(name)
     captures = []
-    known = read_suite_data().suites[suite_name]
+    known = read_suite_data().suites.get(suite_name)
+    origins = suite_origins(suite_name)
     for number, item in enumerate(suite(suite_name)):
-        split = split_for(item.scene.id, item.frame_count)
+        split = split_for(item.id, item.frame_count)
         frames = [
             FrameResult(
                 frame,
@@ -57,10 +58,12 @@ def complete_results(
         captures.append(
             replace(
                 base.captures[0],
-                id=item.scene.id,
-                digest=known[item.scene.id].versions[0].digest,
-                hands=item.scene.hands,
-                perturbations=[call.kind for call in item.scene.effects],
+                id=item.id,
+                digest=known[item.id].versions[0].digest if known else "e" * 64,
+                origin=origins.get(item.id),
+                exact_masks=item.exact_masks,
+                hands=item.hands,
+                perturbations=list(item.perturbations),
                 split_digest=split.digest,
                 frames=frames,
             )

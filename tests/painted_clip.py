@@ -19,7 +19,7 @@ from hwp_bench.importers.video.model import pose_vertices
 from hwp_bench.importers.video.pictures import HandPictures, PictureResidual, TextureResidual
 from hwp_bench.importers.video.solve import FittedClip, Footage, SolveSettings, fit_landmarks
 
-SETTINGS = SolveSettings(start_steps=40, landmark_steps=80, contour_steps=50, picture_rounds=3)
+SETTINGS = SolveSettings(start_steps=40, landmark_steps=80, contour_steps=50, picture_rounds=2)
 FRAMES, SIZE, HAND = 20, 160, 150.0
 #: What the paint is multiplied by in each channel.
 TINT = np.array([1.0, 0.8, 0.65], np.float32)

@@ -196,7 +196,7 @@ def scope_scores(captures: Iterable[CaptureScores]) -> dict[str, Scores]:
     """Return the mean scores of each scope that has any: those of `scopes`."""
     mean = aggregate(captures)
     found = {
-        MACRO: mean.overall.macro,
+        MACRO: mean.overall.macro or mean.overall.capture_mean,
         "single": mean.single.capture_mean if mean.single else {},
         "interacting": mean.interacting.capture_mean if mean.interacting else {},
         **mean.overall.perturbations,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,6 +15,7 @@ from msgspec import Meta
 
 from hwp_bench.base.arrays import read_npz, take, write_npz
 from hwp_bench.base.errors import BadCapture, BadInput
+from hwp_bench.base.files import sha256_json
 from hwp_bench.base.records import Text, parse_record, without_schema
 from hwp_bench.hands.skeleton import JOINT_COUNT, Camera, HandParameters
 from hwp_bench.hands.template import HandTemplate, rebuilt
@@ -142,6 +143,18 @@ class CaptureInfo:
         name, version = maker.get("name"), maker.get("version")
         return f"{name} {version}" if isinstance(name, str) and isinstance(version, int) else None
 
+    @property
+    def origin(self) -> str | None:
+        """Digest (hex) of what an imported video's capture was made from; None for others.
+
+        Two machines may round an import otherwise, and the digests of its captures then differ:
+        with one origin they differ in nothing else.
+        """
+        video, frames = self.source.get("video"), self.source.get("frames")
+        if not isinstance(video, Mapping) or not isinstance(frames, list) or not self.made_by:
+            return None
+        return import_origin(video.get("sha256"), self.made_by, frames, self.width, self.hands)
+
     def severity(self, frame: int) -> dict[str, int | None]:
         """Return the severity of every declared perturbation in one frame."""
         return {
@@ -220,6 +233,13 @@ class CaptureInfo:
                 raise BadCapture(said, where=where, field="times")
         check_id(info.id, where)
         return info
+
+
+def import_origin(
+    sha256: object, made_by: str, frames: Iterable[object], size: int, hands: str
+) -> str:
+    """Return the digest of a video, its importer, the frames and what was asked for."""
+    return sha256_json([sha256, made_by, list(frames), size, hands])
 
 
 def check_id(identifier: str, where: str) -> None:

@@ -24,6 +24,7 @@ from hwp_bench.cli.options import (
     print_result,
     splits_of,
 )
+from hwp_bench.taxonomy import REAL_SUITES
 
 if TYPE_CHECKING:
     from hwp_bench.capture.check import CheckReport
@@ -181,12 +182,17 @@ def _print_audit(report: AuditReport) -> None:
 
 
 _GET = """examples:
+  hwp-bench data get real-1
+  hwp-bench data get real-1 --from my_videos
   hwp-bench data get hwp
   hwp-bench data get hwp -o WildGHand --capture capture0_ capture1_
   hwp-bench data get hwp --revision 0123456789abcdef
 
-Needs huggingface_hub: pip install 'hwp-bench[hub]'. Run the same command again to continue an
+hwp needs huggingface_hub: pip install 'hwp-bench[hub]'. Run the same command again to continue an
 interrupted download. Checksums are pinned on first use; existing files are never replaced.
+
+real-1 needs the tracker: pip install 'hwp-bench[track]'. Its clips are downloaded, checked by their
+SHA-256, tracked and imported into the cache. Exit status 1: a clip could not be had.
 """
 
 
@@ -194,18 +200,23 @@ def _add_get(parser: argparse.ArgumentParser) -> None:
     parser.description = "Download a public data set."
     parser.epilog = _GET
     add = parser.add_argument
-    add("name", choices=("hwp",), help="hwp: the official release")
+    text = "hwp: the official release; real-1: a suite of real clips"
+    add("name", choices=("hwp", *REAL_SUITES), help=text)
     out = Path("WildGHand")
-    add("-o", "--out", type=Path, default=out, metavar="DIR", help="folder to make")
-    text = "only folders whose names begin with this"
+    add("-o", "--out", type=Path, default=out, metavar="DIR", help="hwp: folder to make")
+    text = "hwp: only folders whose names begin with this"
     add("--capture", **SEVERAL, metavar="NAME", help=text)
-    add("--revision", help="branch, tag or commit (default: the newest)")
+    add("--revision", help="hwp: branch, tag or commit (default: the newest)")
+    text = "real-1: take the videos from here, whatever they are called, not from the network"
+    add("--from", dest="source", type=Path, metavar="FOLDER", help=text)
     add_json(parser, "print what was downloaded as JSON")
 
 
 def _get(args: argparse.Namespace) -> int:
     from hwp_bench.importers.official.download import HuggingFaceHub, download_release
 
+    if args.name in REAL_SUITES:
+        return _get_clips(args)
     check_places({"--out": args.out}, {})
     with JobsView() as jobs:
         made = download_release(
@@ -224,6 +235,17 @@ def _get(args: argparse.Namespace) -> int:
         f"commit: {made.commit}",
     )
     return print_result(args.json, value, lines)
+
+
+def _get_clips(args: argparse.Namespace) -> int:
+    from hwp_bench.suites.real import ensure_clips
+
+    folders, missing = ensure_clips(args.name, args.source)
+    lines = [f"capture: {folder}" for folder in folders]
+    lines += [f"missing: {clip}" for clip in missing]
+    value = {"captures": [str(folder) for folder in folders], "missing": dict(missing)}
+    print_result(args.json, value, lines)
+    return int(bool(missing))
 
 
 _TRACK = """examples:
@@ -317,7 +339,7 @@ def _add_inputs(parser: argparse.ArgumentParser) -> None:
 def _inputs(args: argparse.Namespace) -> int:
     from hwp_bench.commitments.inputs import check_place, write_inputs
     from hwp_bench.commitments.publication import open_captures
-    from hwp_bench.sim import ensure_suite
+    from hwp_bench.suites.suite import ensure_suite
 
     # Before a suite is rendered.
     check_places({"--out": args.out}, {"--capture": args.capture, "--splits": args.splits})
@@ -381,6 +403,41 @@ def _publish(args: argparse.Namespace) -> int:
         f"commitment: {made.commitment}",
     )
     return print_result(args.json, value, lines)
+
+
+_SECOND_VIEW = """examples:
+  hwp-bench data second-view front side --calibration cameras.toml     # captures of two videos
+  hwp-bench data second-view cam400015 cam400016                       # of a data set
+
+What the second camera saw at the same time becomes the free-view clip of CAPTURE, whose scores are
+apart. docs/video.md describes the calibration file.
+"""
+
+
+def _add_second_view(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = _SECOND_VIEW
+    add = parser.add_argument
+    add("capture", type=Path, metavar="CAPTURE", help="capture folder, which gets the clip")
+    add("second", type=Path, metavar="SECOND", help="capture of the second camera")
+    text = "where both cameras are; needed for videos"
+    add("--calibration", type=Path, metavar="TOML", help=text)
+    add("--force", action="store_true", help="replace an existing clip")
+    add_json(parser, "print the numbers as JSON")
+
+
+def _second_view(args: argparse.Namespace) -> int:
+    from hwp_bench.capture import open_capture
+    from hwp_bench.importers.second_view import add_second_view, read_calibration
+
+    calibration = None if args.calibration is None else read_calibration(args.calibration)
+    captures = open_capture(args.capture), open_capture(args.second)
+    made = add_second_view(*captures, calibration, overwrite=args.force)
+    place = args.capture / "free"
+    lines = [f"free-view clip: {place}, {len(made.frames)} frames"]
+    if made.scale is not None:
+        lines.append(f"scale: a metre of the capture is {made.scale:.3f} m")
+    lines.append(f"landmarks: {made.distance_px:.2f} px from where the second camera saw them")
+    return print_result(args.json, {"clip": str(place), **asdict(made)}, lines)
 
 
 _CONVERT = """examples:
@@ -461,6 +518,7 @@ COMMANDS = {
     "track": (_add_track, _track),
     "inputs": (_add_inputs, _inputs),
     "publish": (_add_publish, _publish),
+    "second_view": (_add_second_view, _second_view),
     "convert": (_add_convert, _convert),
     "export": (_add_export, _export),
 }

@@ -136,7 +136,7 @@ def _running(
     """
     from hwp_bench.evaluation.evaluate import check_call, check_results_place, check_suite
     from hwp_bench.run.engine.options import engine_for, needs_of
-    from hwp_bench.sim import ensure_suite
+    from hwp_bench.suites.suite import ensure_suite
 
     splits = splits_of(args) if sealed is None else sealed.splits
     folder = getattr(args, "sealed", None)
@@ -450,7 +450,7 @@ def _demo(args: argparse.Namespace) -> int:
     from hwp_bench.methods import find_method, read_manifest
     from hwp_bench.report.sources import ResultsSource
     from hwp_bench.report.tables import all_tables
-    from hwp_bench.sim import ensure_suite
+    from hwp_bench.suites.suite import ensure_suite
 
     out, settings, replaces = Path(args.out), EvaluationSettings("smoke"), args.overwrite
     manifests = [read_manifest(find_method(method)) for method in args.methods]

@@ -31,6 +31,9 @@ def command_tree() -> Command:
         "get": Command("download a public data set", f"{here}.data:get"),
         "import": Command("make captures or predictions of other data", commands=imports),
         "import-video": Command("make a capture of a video", f"{here}.imports:video"),
+        "second-view": Command(
+            "make a free-view clip of a second camera", f"{here}.data:second_view"
+        ),
         "track": Command("track the hands of a video", f"{here}.data:track"),
         "inputs": Command("write the inputs of a program of your own", f"{here}.data:inputs"),
         "publish": Command(

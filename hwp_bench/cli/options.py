@@ -67,7 +67,7 @@ def add_capture_folders(parser: argparse.ArgumentParser, purpose: str) -> None:
 def add_suite_or_captures(parser: argparse.ArgumentParser) -> None:
     """Add `--suite` and `--capture`, of which one can be given, and `--splits`."""
     add = parser.add_mutually_exclusive_group().add_argument
-    text = "simulated captures, rendered on first use (default mini)"
+    text = "captures that are rendered, or imported, on first use (default mini)"
     add("--suite", choices=SUITES, default="mini", help=text)
     add("--capture", **SEVERAL, metavar="PATH", help="capture folders, instead of a suite")
     add_splits(parser)
@@ -99,8 +99,7 @@ def captures_of(places: Sequence[str] | None, file: Path) -> list[Path]:
     """Return the capture folders that a result is verified with."""
     from hwp_bench.evaluation.verify import capture_folders
     from hwp_bench.results import read_results
-    from hwp_bench.sim import ensure_suite
-    from hwp_bench.sim.produce.capture import suite_names
+    from hwp_bench.suites.suite import ensure_suite
 
     if places:
         folders = capture_folders([Path(place) for place in places])
@@ -108,7 +107,7 @@ def captures_of(places: Sequence[str] | None, file: Path) -> list[Path]:
             raise UsageError("there is no capture", field="--captures")
         return folders
     suite = read_results(file).suite
-    if suite not in suite_names():
+    if suite not in SUITES:
         raise UsageError(
             f"was not made on a suite ({suite})",
             where=file,

@@ -11,7 +11,7 @@ from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import check_places
 from hwp_bench.cli.options import add_actions, add_json, print_json, print_result
 from hwp_bench.run.engine.options import add_engine_arguments, engine_for, needs_of
-from hwp_bench.taxonomy import SUITES
+from hwp_bench.taxonomy import SIMULATED_SUITES
 
 if TYPE_CHECKING:
     from hwp_bench.commitments import SealedRecipe
@@ -66,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
     add = make.add_argument
     add("scenes", nargs="*", metavar="SCENE", help="scenes that come along")
-    add("--suite", choices=SUITES, help="the scenes, frames and size of a suite")
+    add("--suite", choices=SIMULATED_SUITES, help="the scenes, frames and size of a suite")
     add("-o", "--out", required=True, metavar="DIR", help="folder of the suite")
     add("--frames", type=int, help="frames of each capture (default 60)")
     add("--size", type=int, help="edge of the images in pixels (default 176)")

@@ -6,7 +6,7 @@ import argparse
 
 from hwp_bench.cli.options import add_actions, add_json
 from hwp_bench.run.engine.options import add_engine_arguments
-from hwp_bench.taxonomy import SUITES
+from hwp_bench.taxonomy import SIMULATED_SUITES
 
 _EXAMPLES = """examples:
   hwp-bench sim list
@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add, text = render.add_argument, "scene name or file, all, or wild-dev, wild-test, persistent"
     add("scene", metavar="SCENE", nargs="?", help=text)
     add("-o", "--out", help="folder to make; for all and for suites their parent")
-    add("--suite", choices=SUITES, help="render a suite")
+    add("--suite", choices=SIMULATED_SUITES, help="render a suite")
     _add_extent(render)
     _add_variation(render)
     add("--seed", type=int, help="another seed of everything random")

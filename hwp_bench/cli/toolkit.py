@@ -57,16 +57,16 @@ def _perturbations() -> Table:
 
 
 def _suites() -> Table:
-    from hwp_bench.sim import suite
+    from hwp_bench.suites.suite import suite
 
     rows = []
     for name in SUITES:
         items = suite(name)
         frames = sum(item.frame_count for item in items)
-        which = ", ".join(item.scene.id for item in items)
+        which = ", ".join(item.id for item in items)
         rows.append((name, len(items), frames, f"{items[0].size} px", which))
     titles = "suite, captures, frames, size, which"
-    return named_table("Suites of simulated captures", titles, rows)
+    return named_table("Suites", titles, rows)
 
 
 def _methods() -> Table:

@@ -190,6 +190,7 @@ def _evaluate(
         isolation=one_line(record.isolation) if record.isolation else None,
         free_view=FreeViewResult(clip.digest, free.scores, free.digest) if clip and free else None,
         made_by=capture.info.made_by,
+        origin=capture.info.origin,
         exposed=evaluation.exposed,
     )
     warnings = colour_warnings(targets, scored.predictions)

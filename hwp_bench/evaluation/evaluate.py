@@ -46,7 +46,7 @@ from hwp_bench.results import CaptureResult, MethodId, Results, write_results
 from hwp_bench.results.schema import environment
 from hwp_bench.run.engine import Engine, LocalEngine, Needs
 from hwp_bench.run.runner import rehearse_method
-from hwp_bench.sim.produce.capture import SuiteItem, is_rendered, suite
+from hwp_bench.suites.suite import SuiteCapture, is_ready, suite
 
 #: Most seconds that a method may take to be made before the first capture.
 REHEARSAL_SECONDS = 600.0
@@ -302,13 +302,13 @@ def check_suite(
     *,
     rehearse: bool = True,
 ) -> bool:
-    """Refuse what would fail on a suite, before it is rendered."""
+    """Refuse what would fail on a suite, before it is rendered or imported."""
     items = suite(settings.suite)
     for item in items:
-        split_for(item.scene.id, item.frame_count, splits)
+        split_for(item.id, item.frame_count, splits)
     if manifest.kind == "predictions":
         _check_predictions(manifest, items)
-    if is_rendered(settings.suite):
+    if is_ready(settings.suite):
         return False
     with exclusive(out):
         pass
@@ -317,8 +317,8 @@ def check_suite(
     return rehearse
 
 
-def _check_predictions(manifest: MethodManifest, items: Sequence[SuiteItem]) -> None:
-    names = [item.scene.id for item in items]
+def _check_predictions(manifest: MethodManifest, items: Sequence[SuiteCapture]) -> None:
+    names = [item.id for item in items]
     folders = {
         name: inside(manifest.root, f"{manifest.entry.predictions}/{name}") for name in names
     }

@@ -29,7 +29,6 @@ from hwp_bench.capture.splits import Split, split_for
 from hwp_bench.evaluation.artifacts import FREE_PREDICTIONS
 from hwp_bench.evaluation.capture_evaluation import RESULT, key_of
 from hwp_bench.evaluation.scoring import Target, read_targets, score_frames_of
-from hwp_bench.evaluation.sentences import find_missing, find_other_captures, is_of_suite
 from hwp_bench.metrics import METRICS, PROTOCOLS, metric_names
 from hwp_bench.metrics.lpips import load_available
 from hwp_bench.metrics.protocol import HWP_V1
@@ -44,7 +43,8 @@ from hwp_bench.results import (
 )
 from hwp_bench.results.schema import MAX_BYTES, code_digest, environment
 from hwp_bench.results.store import content_digest
-from hwp_bench.sim.produce.capture import suite_names
+from hwp_bench.suites.suite import find_missing, find_other_captures, is_of_suite
+from hwp_bench.taxonomy import SUITES
 
 #: Largest difference of a score that rounding on another processor may make.
 TOLERANCE = 1e-6
@@ -64,8 +64,8 @@ class Discrepancy:
     #: Id of the capture; empty for the whole result.
     capture: str
     #: The part that was verified: `capture`, `split`, `frames`, `predictions`, `protocols`, a label
-    #: (`hands`, `perturbations`, `exact_masks`, `made_by`), `key`, `suite`, `digest`, a stored
-    #: copy or table, or a frame and metric.
+    #: (`hands`, `perturbations`, `exact_masks`, `made_by`, `origin`), `key`, `suite`, `digest`, a
+    #: stored copy or table, or a frame and metric.
     what: str
     #: Its value in the result.
     recorded: str
@@ -141,7 +141,7 @@ def verify_results(
                 "another: method, settings, seed, budget, frames, protocols or metrics were changed"
             )
             found.append(Discrepancy(record.id, "key", record.key, text))
-    if results.suite in suite_names():
+    if results.suite in SUITES:
         problems = find_missing(results) if splits is None else find_other_captures(results)
         foreign = [one.info.id for one in fitting if not is_of_suite(one.info, results.suite)]
         problems += [f"is of other scenes or sizes: {', '.join(foreign)}"] if foreign else []
@@ -203,6 +203,7 @@ def _capture_differences(
         "perturbations": list(capture.info.perturbations),
         "exact_masks": all(target.exact for target in targets),
         "made_by": capture.info.made_by,
+        "origin": capture.info.origin,
     }
     for label, value in labels.items():
         if getattr(record, label) != value:

@@ -12,7 +12,6 @@ from hwp_bench.analysis.compare import Rank, compare, rank_methods, verdict
 from hwp_bench.analysis.pairing import MACRO, group_runs, same_but_seed, scope_scores
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.tables import Column, Table
-from hwp_bench.evaluation.sentences import find_missing
 from hwp_bench.leaderboard.entries import BADGES, LEVELS, Entry
 from hwp_bench.leaderboard.rules import HEADLINE, current, source_of, tables_of, takes_over
 from hwp_bench.leaderboard.suite_data import Severities, on_current_data, suite_severities
@@ -22,6 +21,7 @@ from hwp_bench.metrics.score import CaptureScores
 from hwp_bench.report.study_tables import METRIC
 from hwp_bench.results import CaptureResult, Results
 from hwp_bench.results.schema import score_rows
+from hwp_bench.suites.suite import find_missing
 from hwp_bench.taxonomy import PERTURBATIONS, perturbation
 
 #: The badge of a row is the first of these that one of its entries has.

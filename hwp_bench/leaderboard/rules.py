@@ -24,14 +24,14 @@ from hwp_bench.base.files import read_json, write_json
 from hwp_bench.base.packages import data_folder
 from hwp_bench.base.records import Digest, Line, parse_record, without_schema
 from hwp_bench.evaluation.capture_evaluation import RESULT, key_of
-from hwp_bench.evaluation.sentences import find_missing, find_wrong_labels
 from hwp_bench.evaluation.verify import Discrepancy, copy_differences, digest_differences
 from hwp_bench.leaderboard.entries import LEVELS, Check, Entry, read_entries
-from hwp_bench.leaderboard.suite_data import CaptureData, known_data, on_current_data
+from hwp_bench.leaderboard.suite_data import CaptureData, known_data, on_current_data, suite_origins
 from hwp_bench.methods.manifest import shipped_methods
 from hwp_bench.metrics import HWP_V1, PROTOCOLS, metric_names, penalty
 from hwp_bench.metrics.score import aggregate
 from hwp_bench.results.schema import MAX_BYTES, CaptureResult, score_rows
+from hwp_bench.suites.suite import find_missing, find_wrong_labels
 from hwp_bench.taxonomy import SUITES as ALL_SUITES
 
 #: Suites whose captures are the same everywhere. `wild-dev` is for tuning.
@@ -363,7 +363,11 @@ def check_bound(entry: Entry) -> None:
     if problems := find_wrong_labels(entry.results):
         raise _wrong(entry, "captures", "; ".join(problems))
     known = known_data().suites.get(entry.results.suite, {})
+    origins = suite_origins(entry.results.suite)
     for capture in entry.results.captures:
+        if origins and capture.origin != origins.get(capture.id):
+            problem = "is not what this version imports the suite's clip from"
+            raise _wrong(entry, f"{capture.id}.origin", problem)
         _check_data(entry, capture, known.get(capture.id))
         _check_frames(entry, capture)
         _check_times(entry, capture)

@@ -35,7 +35,7 @@ from hwp_bench.leaderboard.suite_data import on_current_data
 from hwp_bench.report.sources import ResultsSource
 from hwp_bench.results import Results, read_results
 from hwp_bench.results.schema import environment
-from hwp_bench.sim.produce.capture import suite
+from hwp_bench.suites.suite import suite
 
 #: Where entries lie in the repository, and in a submission.
 PLACE = "leaderboard/entries"
@@ -97,7 +97,7 @@ def submit(
 
 def _check_predictions(source: ResultsSource) -> int:
     """Return the number of captures whose predictions are there and are those of the result."""
-    sizes = {item.scene.id: item.size for item in suite(source.results.suite)}
+    sizes = {item.id: item.size for item in suite(source.results.suite)}
     found = 0
     for capture in source.results.captures:
         place = source.place(capture.id, "predictions")

@@ -18,10 +18,12 @@ from hwp_bench.base.packages import data_folder
 from hwp_bench.base.records import Digest, Line, parse_record, without_schema
 from hwp_bench.capture import open_capture
 from hwp_bench.capture.splits import split_for
-from hwp_bench.evaluation.sentences import is_of_suite
 from hwp_bench.results import Results
 from hwp_bench.sim.produce.capture import RENDERER, suite, suite_names
 from hwp_bench.sim.scene.scene import moments, severity
+from hwp_bench.suites.real import read_clips
+from hwp_bench.suites.suite import is_of_suite
+from hwp_bench.taxonomy import REAL_SUITES
 
 #: Version of the file.
 SCHEMA = "hwp-suite-data/2"
@@ -82,18 +84,26 @@ def known_data() -> SuiteData:
 
 
 def on_current_data(results: Results) -> Results:
-    """Return results with the digests of this version where theirs differ in rounding alone.
+    """Return results with one digest for captures that differ in rounding alone.
 
-    So results of two such versions can be compared. Other digests stay.
+    Of a simulated capture it is that of this version, of a real clip its origin. So results on such
+    captures can be compared. Other digests stay.
     """
-    known = known_data().suites.get(results.suite, {})
+    known, origins = known_data().suites.get(results.suite, {}), suite_origins(results.suite)
     captures = []
     for capture in results.captures:
         data = known.get(capture.id)
         if data is not None and data.current is not None and data.version(capture.digest):
             capture = replace(capture, digest=data.current.digest)
+        if (origin := origins.get(capture.id)) and origin == capture.origin:
+            capture = replace(capture, digest=origin)
         captures.append(capture)
     return replace(results, captures=captures)
+
+
+def suite_origins(name: str) -> Mapping[str, str]:
+    """Return what each clip of a suite of real clips is imported from; empty for other suites."""
+    return {clip.id: clip.origin for clip in read_clips(name)} if name in REAL_SUITES else {}
 
 
 #: By capture and perturbation: mean severity of the frames that show it, rounded.
@@ -106,10 +116,10 @@ def suite_severities(name: str) -> Severities:
 
     It is read from the scenes, so that no capture has to be on this machine: the mean over the
     frames to learn from that show the perturbation, rounded, as `hwp-bench table --by severity`
-    takes it from captures.
+    takes it from captures. Of real clips nothing is known.
     """
     found: dict[str, dict[str, int]] = {}
-    for item in suite(name):
+    for item in () if name in REAL_SUITES else suite(name):
         test = set(split_for(item.scene.id, item.frame_count).test.tolist())
         every = enumerate(moments(item.frame_count).tolist())
         learnt = [moment for frame, moment in every if frame not in test]

@@ -25,6 +25,7 @@ from hwp_bench.capture.schema import CaptureInfo, frame_name
 from hwp_bench.results import CaptureResult, Results, results_among
 from hwp_bench.results.schema import MAX_FRAMES
 from hwp_bench.results.store import read_unchanged
+from hwp_bench.suites.suite import lost_clips
 
 #: Largest file of temporal weights that is read, bytes.
 MAX_WEIGHT_BYTES = 16 * 1024 * 1024
@@ -171,11 +172,11 @@ def _located(
     """The captures' own descriptions and their places, by digest."""
     digests = {c.digest: c.id for result in results for c in result.captures}
     places = [Path(folder) for folder in folders]
-    rendered = cache_root() / "sim" / "captures"
+    caches = [cache_root() / kind / "captures" for kind in ("sim", "real")]
     for identifier in sorted(set(digests.values())):
         # A name from outside matches itself and nothing else.
         name = glob.escape(identifier.replace("/", "_"))
-        places += sorted(rendered.glob(f"{name}-*"))
+        places += [place for cache in caches for place in sorted(cache.glob(f"{name}-*"))]
     found = {}
     for place in places:
         path = place / "capture.json"
@@ -249,6 +250,7 @@ def _text(results: Results) -> str:
     protocol = sha256_json(results.protocols)[:8]
     parts = [
         f"{results.suite}, {count} capture{'' if count == 1 else 's'}, {frames} test frames",
+        *lost_clips(results),
         f"protocol {headline or 'not said'} ({protocol})",
     ]
     estimated = sum(not capture.exact_masks for capture in results.captures)

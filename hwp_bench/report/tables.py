@@ -22,6 +22,7 @@ from hwp_bench.results.schema import (
     per_second,
     score_rows,
 )
+from hwp_bench.suites.suite import lost_clips
 from hwp_bench.taxonomy import PERTURBATIONS, perturbation
 
 #: Metrics of the headline tables, where an evaluation has them.
@@ -234,14 +235,12 @@ def _render_rate(result: Results) -> float | None:
 
 
 def _scope(results: Sequence[Results]) -> str:
-    counts = {
-        (result.suite, len(result.captures), sum(len(c.frames) for c in result.captures))
-        for result in results
-    }
-    return "; ".join(
-        f"{suite}: {captures} captures, {frames} test frames"
-        for suite, captures, frames in sorted(counts)
-    )
+    every = set()
+    for result in results:
+        captures, frames = len(result.captures), sum(len(c.frames) for c in result.captures)
+        text = f"{result.suite}: {captures} captures, {frames} test frames"
+        every.add((result.suite, captures, frames, ", ".join([text, *lost_clips(result)])))
+    return "; ".join(text for *_, text in sorted(every))
 
 
 _NOTE = "Means over seeds, where a method has several; `--by seeds` shows how they spread."

@@ -154,6 +154,9 @@ class CaptureResult:
     #: Importer and version that made the hand parameters and masks, such as `video 2`; None where
     #: the capture does not say so (simulated ones do not), and where it was not recorded.
     made_by: Line | None = None
+    #: What an import was made from (`CaptureInfo.origin`): captures of one origin differ in
+    #: rounding alone. None for others, and where it was not recorded.
+    origin: Line | None = None
     #: Digest of the files that the method was shown next to its request (`--expose`, settings that
     #: name files), a part of `key`; None where there were none, and where it was not recorded.
     exposed: Line | None = None

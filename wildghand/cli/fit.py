@@ -19,12 +19,12 @@ from wildghand.cli.options import (
 
 if TYPE_CHECKING:
     from wildghand.fitting.parallel import World
-    from wildghand.fitting.session import Watch
     from wildghand.from_video import MadeAvatar
+    from wildghand.viewer.live import ServedFit
 
 
 @contextlib.contextmanager
-def watching(args: argparse.Namespace, *, shown: bool) -> Iterator[Watch | None]:
+def watching(args: argparse.Namespace, *, shown: bool) -> Iterator[ServedFit | None]:
     """Serve the page of a fit while the block runs, if it is `shown`."""
     if not shown:
         yield None
@@ -34,7 +34,7 @@ def watching(args: argparse.Namespace, *, shown: bool) -> Iterator[Watch | None]
 
     with serve_fit(address_of(args)) as served:
         notice(f"The fit is shown at {served.url}")
-        yield served.watch
+        yield served
 
 
 _FIT_EXAMPLES = """examples:
@@ -119,9 +119,15 @@ def _video(args: argparse.Namespace, world: World) -> int:
         seed=args.seed,
         settings=_settings(args),
     )
-    with watching(args, shown=args.live and world.is_main) as watch:
+    with watching(args, shown=args.live and world.is_main) as served:
         made = make_avatar(
-            args.source, args.out, options, overwrite=args.overwrite, world=world, watch=watch
+            args.source,
+            args.out,
+            options,
+            overwrite=args.overwrite,
+            world=world,
+            watch=None if served is None else served.watch,
+            glimpse=None if served is None else served.glimpse,
         )
     if world.is_main:
         print_json(made.facts()) if args.json else _print(made)
@@ -159,7 +165,7 @@ def _capture(args: argparse.Namespace, world: World) -> int:
     if args.seconds is not None and not args.seconds > 0.0:
         raise UsageError(f"is {args.seconds}", field="--seconds", remedy="Use more than 0.")
     check_fitting(args)
-    with watching(args, shown=args.live and world.is_main) as watch:
+    with watching(args, shown=args.live and world.is_main) as served:
         avatar = fit_capture(
             args.source,
             args.out,
@@ -169,7 +175,7 @@ def _capture(args: argparse.Namespace, world: World) -> int:
             all_frames=args.all_frames is True,
             overwrite=args.overwrite,
             world=world,
-            watch=watch,
+            watch=None if served is None else served.watch,
         )
     if not world.is_main:
         return 0

@@ -17,6 +17,7 @@ from hwp_bench.base.folders import exclusive
 from hwp_bench.base.images import check_encoder
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.importers.video.decode import probe
+from hwp_bench.importers.video.glimpse import Glimpse
 from hwp_bench.methods.contract import Budget
 from hwp_bench.tracking.networks import LiteRtNetworks, load_models
 from wildghand.avatar.avatar import WildGHandAvatar
@@ -100,6 +101,7 @@ def make_avatar(
     overwrite: bool = False,
     world: World = SINGLE_PROCESS,
     watch: Watch | None = None,
+    glimpse: Glimpse | None = None,
 ) -> MadeAvatar:
     """Make an avatar of the hand in a video, with a clip and a sheet to look at.
 
@@ -114,6 +116,7 @@ def make_avatar(
         overwrite: make everything again; replace an avatar that came from elsewhere.
         world: the processes that fit together.
         watch: who is shown the fit while it runs.
+        glimpse: who is shown the hands while they are imported.
 
     Raises:
         BadInput: the video cannot be used, or shows too few frames with a hand.
@@ -125,7 +128,7 @@ def make_avatar(
     """
     options = options or VideoFit()
     folder = default_folder(Path(video)) if out is None else Path(out)
-    job = VideoJob(Path(video), folder, options, world, watch)
+    job = VideoJob(Path(video), folder, options, world, watch, glimpse)
     chosen = read_settings(options.method_settings())
     world.shard(chosen.schedule.batch)
     if world.is_main:

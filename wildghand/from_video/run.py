@@ -33,6 +33,7 @@ from hwp_bench.base.records import Seconds, merged, parse_record
 from hwp_bench.capture.schema import METADATA, check_id
 from hwp_bench.importers.shared.output import CHOICES, check_choices
 from hwp_bench.importers.video import SolveSettings
+from hwp_bench.importers.video.glimpse import Glimpse
 from wildghand.avatar.files import DESCRIPTION
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
 from wildghand.fitting.session import Watch
@@ -103,7 +104,8 @@ def with_quick(settings: Mapping[str, Any], *, quick: bool) -> dict[str, Any]:
 class VideoJob:
     """One video, the folder of its avatar, the choices, and where everything lies.
 
-    `world` are the processes that fit together; `watch` is who is shown the fit while it runs.
+    `world` are the processes that fit together; `watch` is who is shown the fit while it runs, and
+    `glimpse` the hands while they are imported.
     """
 
     def __init__(
@@ -113,9 +115,10 @@ class VideoJob:
         options: VideoFit,
         world: World = SINGLE_PROCESS,
         watch: Watch | None = None,
+        glimpse: Glimpse | None = None,
     ) -> None:
         self.video, self.folder, self.options = video, folder, options
-        self.world, self.watch = world, watch
+        self.world, self.watch, self.glimpse = world, watch, glimpse
         self.work = folder / "work"
         self.record = self.work / "stages.json"
         self.landmarks = options.landmarks or self.work / "landmarks.npz"

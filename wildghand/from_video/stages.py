@@ -216,7 +216,8 @@ class Import(Stage):
         }
 
     def run(self, job: VideoJob) -> None:
-        import_video(job.video, job.landmarks, job.capture, import_options(job))
+        options = import_options(job)
+        import_video(job.video, job.landmarks, job.capture, options, job.glimpse)
 
     def expected(self, job: VideoJob) -> float:
         # A frame takes 0.3 s, one that is decoded only 5 ms.

@@ -303,7 +303,7 @@ class WildGHandModel(nn.Module):
         return rasterize_hands(parts, viewmats, Ks, width, height)
 
     def wall(self, side: str) -> WristWall | None:
-        """What closes the wrist of one hand; None without visibility, or where it stays open."""
+        """What ends the wrist of one hand; None without visibility, or where it stays open."""
         if self.visibility is None or side in self.visibility.open_wrists:
             return None
         return self._walls.get(side)
@@ -402,7 +402,9 @@ class WildGHandModel(nn.Module):
             anchors = rig.follow(pose, betas, transl)
         hand = pose, betas, transl
         if rows is None:
-            return dress(anchors, prediction, self.network.activation)[0], hand
+            made, _ = dress(anchors, prediction, self.network.activation)
+            wall = self.wall(side)
+            return (made if wall is None else wall.trim(made, *hand)), hand
         perturbation = None
         if side in self.perturbation:
             temporal = self.biases_of(side).temporal(rows)

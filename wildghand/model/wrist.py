@@ -1,8 +1,9 @@
-"""A wall across the open end of a wrist.
+"""A wall across the open end of a wrist, and a clean edge around it.
 
 A hand model ends at the wrist, and its mesh is open there. Whoever looks into it sees the inside of
 the skin, which no frame has shown and which the fit has left thin in places: holes. A wall of
-opaque discs, two millimetres inside the hand, closes it.
+opaque discs, two millimetres inside the hand, closes it. Gaussians reach over the border by as much
+as each is wide, so that it would look like the edge of a saw: they are pressed together before it.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from torch.nn.functional import normalize
 
 from hwp_bench.hands import TemplateTensors, anchor_positions, pose_hand
 from hwp_bench.hands.template import boundary_loop
-from wildghand.gaussians.quaternions import matrix_to_quat
+from wildghand.gaussians.quaternions import matrix_to_quat, quat_rotate
 from wildghand.gaussians.rig import HandRig
 from wildghand.model.dress import Gaussians
 
@@ -31,11 +32,14 @@ WIDE, THIN, OPAQUE = 0.7, 0.2, 0.98
 _WIDEST = 0.2
 # Standard deviations of a disc between its centre and the border: it does not show from outside.
 _INSIDE = 2.25
+# Standard deviations of a Gaussian that end before the border; the least distance of its centre
+# from it, and the least standard deviation, m.
+_REACH, _LEAST, _FLAT = 3.0, 3e-4, 2e-5
 
 
 @dataclass(frozen=True, eq=False)
 class WristWall:
-    """M opaque discs that close the open end of a hand."""
+    """M opaque discs that close the open end of a hand, and the edge of its skin there."""
 
     #: Of the hand; posing reads it.
     template: TemplateTensors
@@ -91,6 +95,45 @@ class WristWall:
             opacities=means.new_full((*hand.opacities.shape[:-1], count), OPAQUE),
             colors=colors.expand(*colors.shape[:-2], count, 3),
         )
+
+    @torch.no_grad()
+    def trim(self, hand: Gaussians, pose: Tensor, betas: Tensor, transl: Tensor) -> Gaussians:
+        """A posed hand whose Gaussians end before the plane of the border.
+
+        With depth d behind the plane and standard deviation s along its normal, a Gaussian is
+        pressed together along the normal by d / (3 s) where that is below 1. Others, and those more
+        than 25 mm from the border, are as before.
+
+        Args:
+            pose: (B, 16, 3) axis-angle, rad.
+            betas: (10,) or (B, 10).
+            transl: (B, 3) m.
+        """
+        vertices = pose_hand(self.template, pose, betas, transl).vertices
+        normal = self.plane(vertices)[1][:, None]
+        means = hand.means.clone()
+        frames, count, _ = means.shape
+        scales = hand.scales.expand(frames, count, 3).clone()
+        quats = hand.quats.expand(frames, count, 4).clone()
+        near = means[:, self.skin]
+        depth = ((near - vertices[:, self.border].mean(dim=1, keepdim=True)) * normal).sum(-1, True)
+        # Its axes as columns, each as long as the standard deviation.
+        turns = quat_rotate(quats[:, self.skin, None], torch.eye(3).to(near)).mT
+        axes = turns * scales[:, self.skin, None]
+        along = (axes.mT @ normal[..., None])[..., 0]
+        room = depth.clamp(min=_LEAST)
+        kept = room / (_REACH * along.norm(dim=-1, keepdim=True)).clamp(min=1e-9)
+        row, column = torch.nonzero(kept[..., 0] < 1.0, as_tuple=True)
+        cut, own, axis = self.skin[column], kept[row, column], normal[row, 0]
+        means[row, cut] += (room - depth)[row, column] * axis
+        pressed = axes[row, column]
+        pressed = pressed - (1.0 - own)[..., None] * axis[..., None] * along[row, column, None]
+        pressed = pressed.double()
+        squares, turned = torch.linalg.eigh(pressed @ pressed.mT)
+        turned[..., 0] *= torch.linalg.det(turned)[:, None].sign()
+        scales[row, cut] = squares.clamp(min=0.0).sqrt().clamp(min=_FLAT).to(scales)
+        quats[row, cut] = matrix_to_quat(turned).to(quats)
+        return replace(hand, means=means, scales=scales, quats=quats)
 
     def plane(self, vertices: Tensor) -> tuple[Tensor, Tensor]:
         """The plane of the open end of a posed hand.

@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import trimesh
 
 from hwp_bench.base.console import notice
 from hwp_bench.base.drawing import PAPER, fitted, labelled
+from hwp_bench.importers.video.glimpse import Glimpse, PaintedHand
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.glance import Glance, glance
 from wildghand.gaussians.fit_loop import Loss
 from wildghand.viewer.server import Address, serving, url
 
 if TYPE_CHECKING:
-    from viser import ClientHandle, ViserServer
+    from viser import ClientHandle, GlbHandle, ViserServer
 
 
 #: Larger side of each of the three pictures, px.
@@ -49,6 +51,8 @@ def live_sheet(look: Glance, aspect: float) -> np.ndarray:
 LEAST_PAUSE, SHARE = 1.0, 0.1
 #: Points of the chart; of more, every second one is dropped.
 _POINTS = 400
+# What the metres of a hand are multiplied by: the page's camera stands some units away.
+_ENLARGED = 15.0
 
 
 class Live:
@@ -94,6 +98,8 @@ class LivePage:
         self._last: Glance | None = None
         self._curve: list[tuple[float, float, float]] = []
         self._text = server.gui.add_markdown("The fit is being prepared.")
+        self._meshes: list[GlbHandle] = []
+        server.initial_camera.position, server.initial_camera.look_at = (0.0, -4.0, 0.0), (0.0,) * 3
         self._share = server.gui.add_slider(
             "training frame", min=0, max=100, step=1, initial_value=0, hint="% of the clip"
         )
@@ -122,8 +128,24 @@ class LivePage:
         """Whether a page is open."""
         return bool(self._server.get_clients())
 
+    def show_hands(self, hands: Sequence[PaintedHand]) -> None:
+        """Show hands as an import has fitted them so far; the mouse turns them."""
+        middle = np.concatenate([hand.vertices for hand in hands]).mean(axis=0)
+        for mesh in self._meshes:
+            mesh.remove()
+        self._meshes.clear()
+        for number, hand in enumerate(hands):
+            # The camera looks along z with y down; the page's vertical is z.
+            x, y, z = (_ENLARGED * (hand.vertices - middle)).T
+            places = np.stack([x, z, -y], axis=1)
+            solid = trimesh.Trimesh(places, hand.faces, vertex_colors=hand.colors, process=False)
+            self._meshes.append(self._server.scene.add_mesh_trimesh(f"hand{number}", solid))
+        self._text.content = "The hand, as far as the import has fitted it. The mouse turns it."
+
     def show(self, look: Glance) -> None:
         """Bring every page up to date."""
+        while self._meshes:
+            self._meshes.pop().remove()
         self._last = look
         self._curve.append((float(look.step), look.loss, look.psnr))
         if len(self._curve) > _POINTS:
@@ -156,6 +178,8 @@ class ServedFit:
     url: str
     #: What a fit calls after each step.
     watch: Live
+    #: What an import calls, before it.
+    glimpse: Glimpse
     #: Its web server.
     server: ViserServer
 
@@ -165,4 +189,5 @@ def serve_fit(address: Address | None = None, pause: float = LEAST_PAUSE) -> Ite
     """Serve the page of a fit while the block runs; without an address on this machine only."""
     with serving(address or Address(), "fit") as server:
         page = LivePage(server)
-        yield ServedFit(url(server), Live(page.show, page.wanted, page.row, pause), server)
+        watch = Live(page.show, page.wanted, page.row, pause)
+        yield ServedFit(url(server), watch, page.show_hands, server)

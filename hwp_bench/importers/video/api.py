@@ -26,6 +26,7 @@ from hwp_bench.importers.shared.output import (
     refuse_existing,
     write_capture,
 )
+from hwp_bench.importers.video.glimpse import Glimpse, paint_hand
 from hwp_bench.importers.video.masks import (
     NARROW,
     WIDE,
@@ -66,7 +67,9 @@ from hwp_bench.importers.video.usable import say_faults
 
 #: Version of the fit and the masks. It is raised when they come out otherwise for the same input,
 #: because scores on captures of two versions do not compare.
-IMPORTER_VERSION = 3
+IMPORTER_VERSION = 4
+#: What captures of it say in `CaptureInfo.made_by`.
+MADE_BY = f"video {IMPORTER_VERSION}"
 #: Frames on the overlay sheet.
 SHEET_FRAMES = 24
 #: Endings of the names of images that a sheet can be written to.
@@ -193,6 +196,7 @@ def import_video(
     landmarks: str | os.PathLike[str],
     out: str | os.PathLike[str],
     options: VideoImport | None = None,
+    glimpse: Glimpse | None = None,
 ) -> ImportedClip:
     """Make a capture of a video of one hand or two.
 
@@ -201,6 +205,7 @@ def import_video(
         landmarks: the tracker's npz, as `read_landmarks` describes it.
         out: the capture folder to make.
         options: choices; the defaults where None.
+        glimpse: is shown the hands after each step of the fit.
 
     Returns:
         The clip as it was written, with the numbers that measure it.
@@ -218,7 +223,7 @@ def import_video(
     doubts = landmark_doubts(source)
     for doubt in doubts:
         notice(f"warning: {os.fspath(landmarks)}: it seems that {doubt}.")
-    clip = fit_video(source, options, doubts)
+    clip = fit_video(source, options, doubts, glimpse)
     for warning in clip.warnings[len(doubts) :]:
         notice(f"warning: {warning}. Look at the sheet.")
     store_clip(clip, out, options, call)
@@ -284,7 +289,10 @@ def drop_blank_frames(source: VideoSource) -> VideoSource:
 
 
 def fit_video(
-    source: VideoSource, options: VideoImport, doubts: Sequence[str] = ()
+    source: VideoSource,
+    options: VideoImport,
+    doubts: Sequence[str] = (),
+    glimpse: Glimpse | None = None,
 ) -> ImportedClip:
     """Fit the hands and cut the masks in turns.
 
@@ -296,16 +304,18 @@ def fit_video(
     first_errors = list(map(reprojection_error, fits, hands))
     good = map(follow_landmarks, first_errors, hands)
     refuse_unfitted(dict(zip(source.hands, good, strict=True)), source, doubts)
-    turns = _Turns(source, options, fits)
-    projected, masks = turns.cut(WIDE, reduction=2)
+    turns = _Turns(source, options, fits, glimpse)
+    edge = source.images.working.shape[1]
+    projected, masks = turns.cut(WIDE, min(edge // 2, FIELD_SIZE))
     overlap_landmarks_only = float(masks.overlap[source.detected].mean())
     if len(fits) == 2:
         for hand, fitted in enumerate(fits):
             fitted.landmarks.weaken(projected.trust(hand))
     turns.refine(projected, masks, "outline")
-    turns.refine(*turns.cut(NARROW), "outline", *["texture"] * options.fit.texture)
+    stored = min(edge, source.windows.size)
+    turns.refine(*turns.cut(NARROW, stored), "outline", *["texture"] * options.fit.texture)
     if options.fit.picture_rounds > 0:
-        turns.refine(*turns.cut(NARROW), "pictures")
+        turns.refine(*turns.cut(NARROW, stored), "pictures")
     projected, masks = turns.cut(NARROW)
     imported = {}
     for (side, landmarks), fitted, clip, first in zip(
@@ -351,14 +361,19 @@ class _Turns:
     """The turns of masks and fits of one clip."""
 
     def __init__(
-        self, source: VideoSource, options: VideoImport, fits: Sequence[FittedClip]
+        self,
+        source: VideoSource,
+        options: VideoImport,
+        fits: Sequence[FittedClip],
+        glimpse: Glimpse | None,
     ) -> None:
         self._source, self._fits, self._settings = source, fits, options.fit
+        self._glimpse = glimpse
         self._landmarks = list(source.hands.values())
         self._outlines = self._masks = 0
         self._turns = 4 if options.fit.picture_rounds > 0 else 3
 
-    def cut(self, trust: MaskSettings, reduction: int = 1) -> tuple[ProjectedHands, ClipMasks]:
+    def cut(self, trust: MaskSettings, edge: int | None = None) -> tuple[ProjectedHands, ClipMasks]:
         """Cut the masks of all hands, prompted by the fits as they are now."""
         source, images = self._source, self._source.images
         size = sum(hand.hand_size for hand in self._landmarks) / len(self._landmarks)
@@ -368,8 +383,10 @@ class _Turns:
         with progress(title, len(source.indices)) as update:
             clips = [project_clip(fitted.model, source.windows) for fitted in self._fits]
             projected = ProjectedHands(clips, self._landmarks)
+            if self._glimpse is not None:
+                self._glimpse([paint_hand(clip, images.frames, source.detected) for clip in clips])
             seen, own = source.detected, source.own_masks
-            masks = cut_masks(images, projected, seen, size, trust, own, reduction, update)
+            masks = cut_masks(images, projected, seen, size, trust, own, edge, update)
         return projected, masks
 
     def refine(self, projected: ProjectedHands, masks: ClipMasks, *kinds: str) -> None:

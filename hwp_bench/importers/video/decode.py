@@ -167,9 +167,10 @@ def read_times(path: str | os.PathLike[str]) -> np.ndarray | None:
     stamps: list[float] = []
     with _opened(Path(path)) as video, contextlib.suppress(_library().error.FFmpegError):
         for packet in video.packets():
-            if not video.has_clock or packet.pts is None or packet.time_base >= 1:
+            clock = packet.time_base
+            if not video.has_clock or packet.pts is None or clock is None or clock >= 1:
                 return None
-            stamps.append(float(packet.pts * packet.time_base))
+            stamps.append(float(packet.pts * clock))
     times = np.sort(stamps)
     if len(times) < 2 or np.diff(times).min() < 1e-3:
         return None

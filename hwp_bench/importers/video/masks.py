@@ -18,7 +18,13 @@ import torch
 
 from hwp_bench.hands.raster import draw_faces, draw_silhouette, overlap
 from hwp_bench.hands.template import boundary_vertices
-from hwp_bench.importers.shared.frames import CropWindows, cells, each_frame, resample
+from hwp_bench.importers.shared.frames import (
+    CropWindows,
+    cells,
+    each_frame,
+    resample,
+    surrounding,
+)
 from hwp_bench.importers.shared.landmarks import Landmarks
 from hwp_bench.importers.shared.output import ProjectedHand
 from hwp_bench.importers.video.decode import ClipImages
@@ -151,6 +157,9 @@ _COLOUR_FRAMES = 200
 _FORBIDDING, _WINDOW = -1.0, 0.03
 # Holes narrower than this share of the hand's size are filled.
 _HOLE = 0.02
+# The forearm is cut out up to this distance from the hand, as a share of its size: farther than
+# outlines are looked for.
+_FOREARM = 0.2
 # How much colour counts against smoothness, over GrabCut's own balance, which closes the narrow
 # gaps between fingers.
 _COLOUR_WEIGHT = 4.0
@@ -246,20 +255,25 @@ def _segment(
     if model is None or not prompt.silhouette.any():
         skin = prompt.silhouette
     else:
-        lab = to_lab(image)
         inside, outside = _sure(prompt, hand_size, settings)
+        far = _distance(prompt.silhouette) > _FOREARM * hand_size
         labels = np.full(inside.shape, cv2.GC_PR_BGD, dtype=np.uint8)
         labels[prompt.silhouette > 0] = cv2.GC_PR_FGD
-        labels[outside] = cv2.GC_BGD
+        labels[outside | far] = cv2.GC_BGD
+        # What is surely not hand decides nothing, and costs as much as the rest.
+        open_ = surrounding(labels != cv2.GC_BGD, 2)
+        lab, labels = to_lab(image[open_]), np.ascontiguousarray(labels[open_])
         if prompt.detected:
             edge = max(1, round(_WINDOW * hand_size))
             colour = cv2.blur(np.clip(evidence(lab, model), -5.0, 5.0), (edge, edge))
-            labels[inside & (colour > _FORBIDDING)] = cv2.GC_FGD
+            labels[inside[open_] & (colour > _FORBIDDING)] = cv2.GC_FGD
         # The rectangle is not read in this mode; the mixtures are written to, so copies.
         sharp = model.sharpened(_COLOUR_WEIGHT)
         background, foreground = sharp.background, sharp.foreground
         cv2.grabCut(lab, labels, (0, 0, 1, 1), background, foreground, 1, cv2.GC_EVAL_FREEZE_MODEL)
-        skin = _tidied((labels & 1) * np.uint8(255), prompt.silhouette, hand_size)
+        skin = np.zeros_like(prompt.silhouette)
+        cut = (labels & 1) * np.uint8(255)
+        skin[open_] = _tidied(cut, prompt.silhouette[open_], hand_size)
     return Segmentation(skin, np.where(prompt.hand_side, skin, 0).astype(np.uint8))
 
 
@@ -492,16 +506,18 @@ def cut_masks(
     hand_size: float,
     settings: MaskSettings,
     own: np.ndarray | None = None,
-    reduction: int = 1,
+    edge: int | None = None,
     update: Callable[[int], None] | None = None,
 ) -> ClipMasks:
     """Cut the masks of a clip, prompted by a fit.
 
     In `detected` frames (F,) the pose comes from a detection. `hand_size` is in px of the working
-    images, and so are `own`, (F, S, S) uint8, masks of the user's own.
+    images, and so are `own`, (F, S, S) uint8, masks of the user's own. Images are cut at `edge` px,
+    or as they are.
     """
     working, size = images.working, images.frames.shape[1]
-    edge = working.shape[1] // reduction
+    edge = edge or working.shape[1]
+    shown = images.frames if edge == size else working
 
     def prompt(frame: int) -> Prompt:
         return projected.prompt(frame, edge, bool(detected[frame]))
@@ -509,7 +525,7 @@ def cut_masks(
     if own is None:
         size_here = hand_size * edge / working.shape[1]
         found = segment_clip(
-            lambda frame: resample(working[frame], edge), prompt, len(working), size_here, settings
+            lambda frame: resample(shown[frame], edge), prompt, len(working), size_here, settings
         )
     else:
         given = (resample(mask, edge) for mask in own)

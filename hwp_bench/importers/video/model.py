@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
+from hwp_bench.base.kernels import compiled
 from hwp_bench.hands import HandParameters, HandTemplate, pose_hand
-from hwp_bench.hands.articulation import axis_angle_to_matrix, cross_matrix, right_jacobian
+from hwp_bench.hands.articulation import axis_angle_to_matrix, right_jacobian
 from hwp_bench.hands.skeleton import moved_joints
 from hwp_bench.hands.skinning import only_fingertips
 from hwp_bench.importers.shared.landmarks import PALM, Landmarks
@@ -183,14 +183,16 @@ _CHUNK = 64
 
 def pose_vertices(model: ClipModel) -> np.ndarray:
     """Return the vertices of every frame in the camera frame, (F, V, 3) float32 m."""
-    parameters = model.parameters(np.ones(len(model.variables.turn), dtype=bool))
-    betas = torch.as_tensor(parameters.betas, dtype=torch.float32)
-    pose = torch.as_tensor(parameters.pose, dtype=torch.float32).split(_CHUNK)
-    transl = torch.as_tensor(parameters.transl, dtype=torch.float32).split(_CHUNK)
+    betas = model.variables.betas
     with torch.no_grad():
+        posed = model.pose()
         pieces = [
-            pose_hand(model.tensors, *part).vertices
-            for part in zip(pose, itertools.repeat(betas), transl, strict=False)
+            pose_hand(model.tensors, part, betas, torch.zeros(len(part), 3)).vertices @ rotation.mT
+            + place[:, None]
+            for part, rotation, place in zip(
+                *(whole.split(_CHUNK) for whole in (posed.pose, posed.rotation, posed.place)),
+                strict=True,
+            )
         ]
     return torch.cat(pieces).numpy()
 
@@ -345,32 +347,20 @@ class SurfaceMotion:
 
     def by_variables(self, frame: int, vertices: np.ndarray) -> np.ndarray:
         """Differentiate pixels of P vertices: (P, 2, 51) px per unit of the `frame_variables`."""
-        rotation, wrist = self._rotation[frame], self._joints[0]
-        motion = self._transforms[frame, :, :3]
-        weights = self._weights[vertices]
-        rest = np.append(self._rest(frame, vertices), np.ones((len(vertices), 1)), axis=1)
-        # (P, 16, 3): each joint's share of the vertex, then the share of all joints below each.
-        shares = weights[:, :, None] * np.einsum("kab,vb->vka", motion, rest)
-        below = np.einsum("jk,vka->vja", self._below, shares)
-        centres = np.einsum("kab,kb->ka", motion[:, :, :3], self._joints) + motion[:, :, 3]
-        arms = below - (weights @ self._below.T)[:, :, None] * centres
-        own = below[:, 0]
-        moved = np.zeros((len(vertices), 3, FRAME_VARIABLES))
-        arm = cross_matrix(torch.from_numpy(own - wrist)).numpy()
-        moved[:, :, :3] = -rotation @ arm @ self._turn_rates[frame]
-        # The cross product of each of a joint's three axes with the arm from the joint.
-        x, y, z = np.moveaxis(rotation @ motion[1:, :, :3] @ self._finger_rates[frame], 1, 0)
-        u, v, w = np.einsum("ab,njb->anj", rotation, arms[:, 1:])[..., None]
-        fingers = np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=1)
-        moved[:, :, 3:48] = fingers.reshape(len(vertices), 3, 45)
-        moved[:, 0, 48] = moved[:, 1, 49] = ANCHOR_UNIT / self._focal * self._depth[frame]
-        moved[:, :, 50] = self._place[frame] + rotation @ wrist
-        place = own @ rotation.T + self._place[frame]
-        depth = np.maximum(place[:, 2:], 1e-3)
-        slope = place[:, :2] / depth
-        return np.asarray(
-            (moved[:, :2] - slope[..., None] * moved[:, 2:]) * (self._focal / depth[..., None])
+        rotation, motion = self._rotation[frame], self._transforms[frame, :, :3]
+        turns = motion[:, :, :3]
+        centres = (turns @ self._joints[..., None])[..., 0] + motion[:, :, 3]
+        # The axes that variables turn about are columns; the whole hand turns about the wrist.
+        axes = np.concatenate(
+            [self._turn_rates[frame][None], turns[1:] @ self._finger_rates[frame]]
         )
+        rates = np.zeros((len(vertices), 2, FRAME_VARIABLES))
+        wrist = self._place[frame] + rotation @ self._joints[0]
+        rest, weights = self._rest(frame, vertices), self._weights[vertices]
+        hand = rotation @ axes, np.append(self._joints[:1], centres[1:], axis=0), wrist
+        camera = rotation, self._place[frame], self._focal, ANCHOR_UNIT * self._depth[frame]
+        _pixel_rates(rest, weights, motion, self._below, *hand, *camera, rates)
+        return rates
 
     def _rest(self, frame: int, vertices: np.ndarray) -> np.ndarray:
         rest = self._shaped[vertices]
@@ -380,3 +370,62 @@ class SurfaceMotion:
             turns = Rotation.from_rotvec(self._fingers[frame]).as_matrix() - np.eye(3)
             rest = rest + self._correctives[vertices] @ turns.ravel()
         return np.asarray(rest)
+
+
+@compiled(nogil=True)
+def _pixel_rates(
+    rest: np.ndarray,
+    weights: np.ndarray,
+    motion: np.ndarray,
+    below: np.ndarray,
+    axes: np.ndarray,
+    centres: np.ndarray,
+    wrist: np.ndarray,
+    rotation: np.ndarray,
+    place: np.ndarray,
+    focal: float,
+    anchor: float,
+    rates: np.ndarray,
+) -> None:
+    shares, arm, far = np.zeros((16, 3)), np.zeros(3), np.zeros(3)
+    for p in range(len(rest)):
+        far[:] = place
+        for k in range(16):
+            weight = weights[p, k]
+            for a in range(3):
+                turned = motion[k, a, 3]
+                for b in range(3):
+                    turned += motion[k, a, b] * rest[p, b]
+                shares[k, a] = weight * turned
+                for b in range(3):
+                    far[b] += rotation[b, a] * shares[k, a]
+        z = max(far[2], 1e-3)
+        x, y, scale = far[0] / z, far[1] / z, focal / z
+        for joint in range(16):
+            total, arm[:] = 0.0, 0.0
+            for k in range(16):
+                if below[joint, k] > 0.0 and weights[p, k] > 0.0:
+                    total += weights[p, k]
+                    for a in range(3):
+                        arm[a] += shares[k, a] - weights[p, k] * centres[joint, a]
+            if total == 0.0:
+                continue
+            u, v, w = 0.0, 0.0, 0.0
+            for a in range(3):
+                u += rotation[0, a] * arm[a]
+                v += rotation[1, a] * arm[a]
+                w += rotation[2, a] * arm[a]
+            for column in range(3):
+                # The cross product of the axis and the arm.
+                first, second, third = (
+                    axes[joint, 0, column],
+                    axes[joint, 1, column],
+                    axes[joint, 2, column],
+                )
+                ahead = first * v - second * u
+                number = 3 * joint + column
+                rates[p, 0, number] = scale * (second * w - third * v - x * ahead)
+                rates[p, 1, number] = scale * (third * u - first * w - y * ahead)
+        rates[p, 0, 48] = rates[p, 1, 49] = anchor / z
+        rates[p, 0, 50] = scale * (wrist[0] - x * wrist[2])
+        rates[p, 1, 50] = scale * (wrist[1] - y * wrist[2])

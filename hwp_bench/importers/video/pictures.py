@@ -17,10 +17,10 @@ import numpy as np
 import torch
 
 from hwp_bench.base.colors import COUNT, harmonics
+from hwp_bench.base.kernels import compiled
 from hwp_bench.hands import HandTemplate
-from hwp_bench.hands.anchors import vertex_normals
 from hwp_bench.hands.raster import draw_faces, mix_corners
-from hwp_bench.importers.shared.frames import CropWindows, each_frame
+from hwp_bench.importers.shared.frames import CropWindows, each_frame, surrounding
 from hwp_bench.importers.video.model import (
     FRAME_VARIABLES,
     ClipModel,
@@ -32,6 +32,8 @@ from hwp_bench.importers.video.model import (
 
 # Texels beyond a chart that go on as its border, so that interpolation reads nothing else.
 _MARGIN = 1.5
+# Px, deviation of a Gaussian that is still well taken from pixels.
+_FINE = 2.5
 # OpenCV takes at most 32,767 places in a row.
 _ROW = 1024
 
@@ -66,9 +68,20 @@ def smooth_within(values: np.ndarray, region: np.ndarray, breadth: float) -> np.
     falls towards zero far from it.
     """
     inside = region.reshape(*region.shape, *(1,) * (values.ndim - 2))
-    weight = cv2.GaussianBlur(region.astype(np.float32), (0, 0), breadth)
-    total = cv2.GaussianBlur(np.where(inside, values, 0.0).astype(np.float32), (0, 0), breadth)
+    weight = _smooth(region.astype(np.float32), breadth)
+    total = _smooth(np.where(inside, values, 0.0).astype(np.float32), breadth)
     return np.asarray(total / np.maximum(weight.reshape(inside.shape), 1e-3))
+
+
+def _smooth(image: np.ndarray, breadth: float) -> np.ndarray:
+    """Gaussian mean of an image; a broad one in a reduced image, which costs a fraction."""
+    size = image.shape[1::-1]
+    step = max(int(breadth / _FINE), 1)
+    if step > 1:
+        reduced = tuple(-(-edge // step) for edge in size)
+        image = cv2.resize(image, reduced, interpolation=cv2.INTER_AREA)
+    image = cv2.GaussianBlur(image, (0, 0), breadth / step)
+    return image if step == 1 else cv2.resize(image, size, interpolation=cv2.INTER_LINEAR)
 
 
 class Atlas:
@@ -138,8 +151,8 @@ class LitTexture:
     small least squares. A shadow that the hand casts on itself is in neither.
     """
 
-    #: Edge of the map, texels; twice as many change nothing.
-    EDGE = 256
+    #: Edge of the map, texels; more change nothing.
+    EDGE = 160
     #: Added to colours before the logarithm: noise of dark pixels counts less.
     DARK = 0.04
     # Logarithm of a colour: a frame that differs by more counts less.
@@ -168,19 +181,22 @@ class LitTexture:
             self._colors = np.tile(common, (len(self.atlas), 1))
         for _ in range(turns):
             self._turn(seen)
-        self._map = self.atlas.draw(self._colors)
-        self._known = self.atlas.draw_weights(np.minimum(self._count / self._ENOUGH, 1.0))
+        known = self.atlas.draw_weights(np.minimum(self._count / self._ENOUGH, 1.0))
+        self._map = np.dstack([self.atlas.draw(self._colors), known])
+
+    def shade(self, frame: int, normals: np.ndarray) -> np.ndarray:
+        """Logarithms of the light of a frame on unit normals (P, 3), camera axes: (P, 3)."""
+        return np.asarray(harmonics(normals) @ self._light[frame])
 
     def expected(
-        self, frame: int, face: np.ndarray, mix: np.ndarray, normals: np.ndarray
+        self, face: np.ndarray, mix: np.ndarray, shade: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Colours of P points of the surface in the light of a frame, and how well they are known.
+        """Colours of P points of the surface in light of `shade`, and how well they are known.
 
-        With unit normals (P, 3), camera axes: (P, 3) sRGB in [0, 1], and (P,) in [0, 1].
+        These are (P, 3) sRGB in [0, 1], and (P,) in [0, 1].
         """
-        places = self.atlas.places(face, mix)
-        logs = sample(self._map, places) + harmonics(normals) @ self._light[frame]
-        return np.clip(np.exp(logs) - self.DARK, 0.0, 1.0), sample(self._known, places)
+        found = sample(self._map, self.atlas.places(face, mix))
+        return np.clip(np.exp(found[:, :3] + shade) - self.DARK, 0.0, 1.0), found[:, 3]
 
     def _turn(self, seen: Mapping[int, SeenTexels]) -> None:
         """Fit the light of each frame to the colours, and then the colours to all frames."""
@@ -215,6 +231,8 @@ _LEAST_PIXELS = 50
 _SEEN = 0.004
 # Cosine of the angle to the viewer from which a surface counts.
 _LEAST_FACING = 0.25
+# Pixels around what is compared that smoothing and slopes read.
+_MARGINS = 5
 # Rows in a product of matrices.
 _BLOCK = 24
 
@@ -377,23 +395,51 @@ def linearize(
     ahead of it: the difference grows by the picture's slope times u. `ratio` is px of the images to
     one px of the whole frame. Returns curvature (51, 51) and slope (51,).
     """
-    shares = np.stack([1.0 - found.mix.sum(axis=1), found.mix[:, 0], found.mix[:, 1]], axis=1)
-    corners = faces[found.face].ravel()
-    count = int(faces.max()) + 1
-
-    def collected(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        spread = shares * (found.trust * row_products(first, second))[:, None]
-        return np.bincount(corners, spread.ravel(), minlength=count)
-
-    across, down = found.across, found.down
-    xx, xy, yy = collected(across, across), collected(across, down), collected(down, down)
-    used = np.flatnonzero(xx + yy > 0)
+    corners = np.zeros((int(faces.max()) + 1, 5))
+    _collect(
+        faces, found.face, found.mix, found.error, found.across, found.down, found.trust, corners
+    )
+    used = np.flatnonzero(corners[:, 0] + corners[:, 2] > 0)
     rates = motion.by_variables(frame, used) * ratio
-    xx, xy, yy = (part[used, None] for part in (xx, xy, yy))
+    xx, xy, yy, *pull = corners[used].T
     x, y = rates[:, 0], rates[:, 1]
-    weighed = np.stack([xx * x + xy * y, xy * x + yy * y], axis=1)
-    pull = np.stack([collected(part, found.error)[used] for part in (across, down)], axis=1)
-    return _summed(rates, weighed), np.einsum("pak,pa->k", rates, pull)
+    weighed = np.stack(
+        [xx[:, None] * x + xy[:, None] * y, xy[:, None] * x + yy[:, None] * y], axis=1
+    )
+    slope = np.einsum("pk,p->k", x, pull[0]) + np.einsum("pk,p->k", y, pull[1])
+    return _summed(rates, weighed), slope
+
+
+@compiled(nogil=True)
+def _collect(
+    faces: np.ndarray,
+    face: np.ndarray,
+    mix: np.ndarray,
+    error: np.ndarray,
+    across: np.ndarray,
+    down: np.ndarray,
+    trust: np.ndarray,
+    corners: np.ndarray,
+) -> None:
+    """Sum the weighed products of slopes with each other and with the error at the corners."""
+    for p in range(len(face)):
+        xx = xy = yy = x = y = 0.0
+        for channel in range(error.shape[1]):
+            right, below = across[p, channel], down[p, channel]
+            xx += right * right
+            xy += right * below
+            yy += below * below
+            x += right * error[p, channel]
+            y += below * error[p, channel]
+        for corner in range(3):
+            share = 1.0 - mix[p, 0] - mix[p, 1] if corner == 0 else 1.0 * mix[p, corner - 1]
+            share *= trust[p]
+            row = corners[faces[face[p], corner]]
+            row[0] += share * xx
+            row[1] += share * xy
+            row[2] += share * yy
+            row[3] += share * x
+            row[4] += share * y
 
 
 def _summed(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -435,7 +481,7 @@ class TextureResidual(SurfaceResidual):
     #: Weight, and difference of a pixel that is still normal, log grey.
     WEIGHT, SCALE = 770.0, 0.06
     #: Edge of the texture's map, texels.
-    EDGE = 384
+    EDGE = 256
     # Frames that a texel must have been seen in, each weighed by its facing squared.
     _LEAST_WEIGHT = 5.0
     # Log grey: a frame that differs from the mean by more counts less in the next mean.
@@ -573,28 +619,32 @@ class PictureResidual(SurfaceResidual):
         inside, mask = drawn.inside, self.pictures.masks[frame]
         if np.count_nonzero(inside) < _LEAST_PIXELS or not mask.any():
             return None
+        # Light changes slowly over the surface, so that it is mixed like all that vertices have.
+        shade = drawn.mixed(self.texture.shade(frame, _normals(drawn)))
+        # Only what is around hand and mask is looked at.
+        near = cv2.dilate((inside | (mask > 127)).astype(np.uint8), self._REACH) > 0
+        around = surrounding(near, _MARGINS)
+        inside, mask, near = inside[around], mask[around], near[around]
+        face, mix = drawn.face[around], drawn.mix[around]
         expected = np.zeros((*inside.shape, 3), np.float32)
         known = np.zeros(inside.shape, np.float32)
-        normals = _unit(drawn.mixed(_normals(drawn)))
-        expected[inside], known[inside] = self.texture.expected(
-            frame, drawn.face[inside], drawn.mix[inside], normals
-        )
-        coverage = mask.astype(np.float32) / 255.0
-        image = self.pictures.images[frame].astype(np.float32) / 255.0 * coverage[..., None]
+        expected[inside], known[inside] = self.texture.expected(face[inside], mix[inside], shade)
+        coverage = mask.astype(np.float32) / 255.0**2
+        image = self.pictures.images[frame][around] * coverage[..., None]
         expected, image = (cv2.GaussianBlur(one, (0, 0), self._SMOOTH) for one in (expected, image))
-        near = cv2.dilate((inside | (coverage > 0.5)).astype(np.uint8), self._REACH) > 0
         if self.pictures.other is not None:
-            near &= cv2.dilate(self.pictures.other[frame], self._REACH) == 0
-        error = (image - expected)[near]
-        squared = row_products(error, error) / (3.0 * (2.0 * self.SCALE) ** 2)
-        # Pixels off the hand move as the nearest pixel on it: its border moves with it.
-        nearest = _nearest(inside)[near]
-        trust = known.ravel()[nearest] / (1.0 + squared) ** 2 / self.SCALE**2
+            near &= cv2.dilate(self.pictures.other[frame][around], self._REACH) == 0
+        chosen = np.flatnonzero(near)
         # The mean of both pictures' slopes, as for the texture.
         both = 0.5 * (image + expected)
-        across, down = (cv2.Scharr(both, cv2.CV_32F, *axis) / 32.0 for axis in ((1, 0), (0, 1)))
-        place = (drawn.face.ravel()[nearest], drawn.mix.reshape(-1, 2)[nearest])
-        return Differences(*place, error, across[near], down[near], trust)
+        slopes = (cv2.Scharr(both, cv2.CV_32F, *axis) / 32.0 for axis in ((1, 0), (0, 1)))
+        error, across, down = (one.reshape(-1, 3)[chosen] for one in (image - expected, *slopes))
+        squared = row_products(error, error) / (3.0 * (2.0 * self.SCALE) ** 2)
+        # Pixels off the hand move as the nearest pixel on it: its border moves with it.
+        nearest = _nearest(inside).ravel()[chosen]
+        trust = known.ravel()[nearest] / (1.0 + squared) ** 2 / self.SCALE**2
+        place = (face.ravel()[nearest], mix.reshape(-1, 2)[nearest])
+        return Differences(*place, error, across, down, trust)
 
 
 def _facing(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -606,8 +656,23 @@ def _facing(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def _normals(drawn: Drawn) -> np.ndarray:
-    faces = torch.as_tensor(drawn.faces, dtype=torch.int64)
-    return np.asarray(vertex_normals(torch.as_tensor(drawn.vertices), faces).numpy())
+    """(V, 3) unit, of the vertices: those of their faces, weighed by area."""
+    sums = np.zeros(drawn.vertices.shape)
+    _sum_normals(drawn.vertices, drawn.faces, sums)
+    return _unit(sums)
+
+
+@compiled(nogil=True)
+def _sum_normals(vertices: np.ndarray, faces: np.ndarray, sums: np.ndarray) -> None:
+    for t in range(len(faces)):
+        a, b, c = faces[t]
+        x, y, z = vertices[a]
+        right = vertices[b, 0] - x, vertices[b, 1] - y, vertices[b, 2] - z
+        left = vertices[c, 0] - x, vertices[c, 1] - y, vertices[c, 2] - z
+        for corner in (a, b, c):
+            sums[corner, 0] += right[1] * left[2] - right[2] * left[1]
+            sums[corner, 1] += right[2] * left[0] - right[0] * left[2]
+            sums[corner, 2] += right[0] * left[1] - right[1] * left[0]
 
 
 def _nearest(inside: np.ndarray) -> np.ndarray:

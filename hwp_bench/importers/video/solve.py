@@ -22,7 +22,7 @@ from hwp_bench.importers.video.residuals import LandmarkResidual, OutlineResidua
 #: side: a horizontal field of view of 64 degrees, between a webcam and a phone's main camera.
 LIKELY_FOCAL = 0.8
 #: Steps of Adam in a round of whole pictures.
-PICTURE_STEPS = 40
+PICTURE_STEPS = 60
 # Variables that are the same in all frames; they are held until every frame has found its pose.
 _CONSTANTS = ("betas", "offsets", "log_size", "log_focal")
 # Variables that the outline does not determine reliably.
@@ -68,7 +68,7 @@ class SolveSettings:
     #: Whether the clip's mean texture joins when the outline fits.
     texture: bool = True
     #: Rounds after the outline's: draw the lit hand, lay it onto the frames; 0 leaves them out.
-    picture_rounds: int = 6
+    picture_rounds: int = 4
 
 
 @dataclass(frozen=True)

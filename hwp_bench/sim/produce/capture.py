@@ -18,6 +18,7 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
+from typing import ClassVar
 
 import numpy as np
 
@@ -501,6 +502,29 @@ class SuiteItem:
     frame_count: int
     #: Edge of the image in pixels.
     size: int
+    #: Masks of simulated captures are exact.
+    exact_masks: ClassVar[bool] = True
+
+    @property
+    def id(self) -> str:
+        """Id of the scene and of its capture."""
+        return self.scene.id
+
+    @property
+    def hands(self) -> str:
+        """`right`, `left` or `both`."""
+        return self.scene.hands
+
+    @property
+    def perturbations(self) -> tuple[str, ...]:
+        """Names of the perturbations that it declares, sorted."""
+        return tuple(sorted({call.kind for call in self.scene.effects}))
+
+    def is_source_of(self, info: CaptureInfo) -> bool:
+        """Return whether a capture was rendered from the scene, with these frames and this size."""
+        given = (info.id, info.frame_count, info.width, info.height)
+        wanted = (self.id, self.frame_count, self.size, self.size)
+        return given == wanted and info.source.get("scene_digest") == self.scene.digest
 
 
 # One single-hand and one interacting capture for each perturbation: interaction 0 and 5,

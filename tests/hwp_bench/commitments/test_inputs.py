@@ -83,7 +83,7 @@ def test_a_suite_is_taken_by_name(
         asked.append(name)
         return [capture.root for capture in captures]
 
-    monkeypatch.setattr("hwp_bench.sim.ensure_suite", ensure)
+    monkeypatch.setattr("hwp_bench.suites.suite.ensure_suite", ensure)
     inputs = tmp_path / "inputs"
     assert main(["data", "inputs", "--suite", "smoke", "-o", str(inputs)]) == 0
     assert f"evaluate {inputs / 'submission'} --suite smoke" in capsys.readouterr().out

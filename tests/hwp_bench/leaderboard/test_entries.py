@@ -16,7 +16,6 @@ from made_entries import OTHER_SCORES, complete_results, with_keys
 from hwp_bench.base.errors import BadResult, UsageError
 from hwp_bench.base.packages import data_folder
 from hwp_bench.cli.main import main
-from hwp_bench.evaluation.sentences import find_missing
 from hwp_bench.leaderboard.entries import (
     BADGES,
     LEVELS,
@@ -45,6 +44,7 @@ from hwp_bench.leaderboard.rules import (
 from hwp_bench.leaderboard.submit import add_entry
 from hwp_bench.metrics import PROTOCOLS
 from hwp_bench.results import FrameResult, Results, write_results
+from hwp_bench.suites.suite import find_missing
 
 
 def check_of(entry: Entry, kind: str, verdict: str = "reproduces", day: int = 1) -> Check:

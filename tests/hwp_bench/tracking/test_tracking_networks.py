@@ -20,6 +20,7 @@ from typing import IO
 import numpy as np
 import pytest
 
+from hwp_bench.base.download import Pinned
 from hwp_bench.base.errors import BadInput, HwpError, MissingDependency
 from hwp_bench.importers.video.decode import FrameRange, probe, read_frames
 from hwp_bench.tracking import networks as model_files
@@ -29,7 +30,6 @@ from hwp_bench.tracking.networks import (
     TASK_MEMBERS,
     HandModels,
     LiteRtNetworks,
-    Pinned,
     fetch_models,
     load_models,
     models_folder,

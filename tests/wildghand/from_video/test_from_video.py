@@ -397,7 +397,7 @@ def test_without_the_tracker_or_the_network_one_line_says_so(
 
     with monkeypatch.context() as here:
         here.setenv("HWP_CACHE", str(folder / "cache"))
-        here.setattr("hwp_bench.tracking.networks._open", offline)
+        here.setattr("hwp_bench.base.download.open_address", offline)
         assert main(words) == 1
         told = capsys.readouterr().err
         assert "cannot be downloaded (network is unreachable)" in told

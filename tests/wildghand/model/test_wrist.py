@@ -152,3 +152,77 @@ def test_an_end_too_narrow_or_too_wide_has_no_wall(factor: float) -> None:
     rig = rig_of("right")
     other = dataclasses.replace(rig.template, vertices=factor * rig.template.vertices)
     assert WristWall.of(dataclasses.replace(rig, template=other)) is None
+
+
+def worn(rig: HandRig, seed: int = 0) -> Gaussians:
+    """Gaussians on the skin, turned and stretched by chance, as wide as a fit makes them."""
+    random = torch.Generator().manual_seed(seed)
+    *given, _ = posed(rig)
+    count = len(rig)
+    quats = torch.randn(1, count, 4, generator=random)
+    return Gaussians(
+        means=rig.pose(*given).positions,
+        quats=torch.nn.functional.normalize(quats, dim=-1),
+        scales=1e-3 * (0.3 + 4.0 * torch.rand(count, 3, generator=random)),
+        opacities=torch.full((count,), 0.98),
+        colors=torch.full((1, count, 3), 0.6),
+    )
+
+
+@SIDES
+def test_the_skin_ends_at_the_border(side: str) -> None:
+    """Nothing is drawn more than 2/255 over white beyond 3 px behind the border's plane."""
+    rig = rig_of(side)
+    wall = WristWall.of(rig)
+    assert wall is not None
+    *given, vertices = posed(rig)
+    border = vertices[wall.border].double().numpy()
+    centre, inwards = border.mean(axis=0), wall.plane(vertices[None])[1][0].double().numpy()
+    beside = np.linalg.svd(border - centre)[2][0]
+    cameras = seen_from(centre, beside)
+    places, _ = project(
+        torch.from_numpy(np.stack([centre, centre + 0.03 * inwards]))[None].float(), *cameras
+    )
+    start, way = places[0, 0].numpy(), (places[0, 1] - places[0, 0]).numpy()
+    rows, columns = np.mgrid[:SIZE, :SIZE] + 0.5
+    behind = -((columns - start[0]) * way[0] + (rows - start[1]) * way[1]) / np.hypot(*way)
+    found = {}
+    for name, hand in (("as it is", worn(rig)), ("trimmed", wall.trim(worn(rig), *given))):
+        coverage = rasterize_hands([hand], *cameras, SIZE, SIZE)[1][0, ..., 0].numpy()
+        found[name] = coverage[behind > 3.0].max()
+        assert coverage[(behind < -3.0) & (behind > -20.0)].max() > 0.9
+    assert found["trimmed"] < 2.0 / 255.0 < found["as it is"]
+
+
+@SIDES
+def test_trimmed_gaussians_have_the_pressed_covariance_and_others_stay(side: str) -> None:
+    """Against A S A^T with A = I - (1 - f) n n^T in float64; 1e-5 of the largest variance."""
+    rig = rig_of(side)
+    wall = WristWall.of(rig)
+    assert wall is not None
+    *given, vertices = posed(rig)
+    before, after = worn(rig), wall.trim(worn(rig), *given)
+
+    def covariances(hand: Gaussians) -> np.ndarray:
+        turns = Rotation.from_quat(hand.quats[0].double().numpy()[:, [1, 2, 3, 0]]).as_matrix()
+        scales = hand.scales.double().numpy().reshape(-1, 3)
+        return (turns * scales[:, None] ** 2) @ turns.transpose(0, 2, 1)
+
+    normal = wall.plane(vertices[None])[1][0].double().numpy()
+    centre = vertices[wall.border].double().mean(dim=0).numpy()
+    depth = (before.means[0].double().numpy() - centre) @ normal
+    given_covariances = covariances(before)
+    width = np.sqrt(np.einsum("i,nij,j->n", normal, given_covariances, normal))
+    room = np.maximum(depth, 3e-4)
+    share = np.minimum(room / (3.0 * width), 1.0)
+    near = np.zeros(len(rig), dtype=bool)
+    near[wall.skin.numpy()] = True
+    cut = near & (share < 1.0)
+    assert 20 < cut.sum() < len(rig) // 2
+    press = np.eye(3) - (1.0 - share)[:, None, None] * np.outer(normal, normal)
+    expected = np.where(cut[:, None, None], press @ given_covariances @ press, given_covariances)
+    assert np.abs(covariances(after) - expected).max() < 1e-5 * given_covariances.max()
+    moved = np.where(cut, room - depth, 0.0)[:, None] * normal
+    np.testing.assert_allclose(after.means[0] - before.means[0], moved, atol=1e-6)
+    assert torch.equal(after.means[0, ~cut], before.means[0, ~cut])
+    assert torch.equal(after.quats[0, ~cut], before.quats[0, ~cut])

@@ -19,7 +19,8 @@ from PIL import Image
 from benchmarks.patience import Patience, spent_by
 from hwp_bench.base.images import read_rgb
 from hwp_bench.capture import Cameras, Capture, CaptureWriter, open_capture
-from hwp_bench.hands import HandParameters
+from hwp_bench.hands import HandParameters, load_template
+from hwp_bench.importers.video.glimpse import PaintedHand
 from wildghand.avatar.avatar import WildGHandAvatar, over
 from wildghand.avatar.files import save_avatar
 from wildghand.cli.main import main
@@ -168,6 +169,16 @@ def test_the_page_of_a_fit_shows_its_steps_and_pictures(
         open_page(served.url, tmp_path / "profile", webgl=True) as driver,
     ):
         wait_until(lambda: served.server.get_clients())
+        # While a video is imported: the hand in its colours, here red.
+        hand = load_template()
+        red = np.tile(np.array([255, 0, 0], np.uint8), (len(hand.vertices), 1))
+        served.glimpse([PaintedHand(hand.vertices, hand.faces, red)])
+
+        def reds() -> int:
+            pixels = window(driver).astype(int)
+            return int((pixels[..., 0] - pixels[..., 1:].max(axis=-1) > 60).sum())
+
+        wait_until(lambda: reds() > 2000)
         fit_capture(make_painted().root, settings=settings, watch=served.watch)
         text = "return document.body.textContent"
         words = wait_until(lambda: "step 5" in (found := driver.execute_script(text)) and found)
@@ -176,3 +187,4 @@ def test_the_page_of_a_fit_shows_its_steps_and_pictures(
         # The painted frames stand before a gray wall of 0.35.
         wall = np.array([0.35 * 255.0] * 3)
         wait_until(lambda: (np.abs(window(driver) - wall).max(axis=-1) < 8.0).sum() > 10_000)
+        wait_until(lambda: reds() < 200)

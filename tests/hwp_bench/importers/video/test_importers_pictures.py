@@ -157,7 +157,7 @@ def test_colours_and_light_are_told_apart() -> None:
     point = mix_corners(along, clip.template.faces, face, mix)
     for frame in (0, 7):
         normals = np.tile(np.array([[0.6, 0.0, -0.8]], np.float32), (len(face), 1))
-        found, known = texture.expected(frame, face, mix, normals)
+        found, known = texture.expected(face, mix, texture.shade(frame, normals))
         wanted = (0.2 + 2.0 * point) * TINT * np.exp(normals @ lamp(frame))[:, None]
         assert np.median(known) == pytest.approx(1.0)
         error = np.abs(found - np.clip(wanted - LitTexture.DARK, 0.0, 1.0))[known > 0.99]

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -13,9 +14,11 @@ from hypothesis import strategies as st
 
 from hwp_bench.base.errors import BadCapture
 from hwp_bench.base.files import read_json, write_json
-from hwp_bench.capture import Capture, open_capture
+from hwp_bench.capture import Cameras, Capture, CaptureWriter, open_capture
 from hwp_bench.capture.check import check_capture
 from hwp_bench.capture.schema import FREE_VIEW
+from hwp_bench.evaluation.scoring import read_targets, score_frames_of
+from hwp_bench.importers.second_view import add_second_view
 from hwp_bench.sim.produce import free_view
 from hwp_bench.sim.produce.capture import render_capture
 from hwp_bench.sim.produce.free_view import (
@@ -224,3 +227,35 @@ def test_a_clip_of_another_capture_is_refused(rendered: Path, tmp_path: Path) ->
     with pytest.raises(BadCapture, match="capture around it") as caught:
         _ = open_capture(tmp_path / "copy").free_view
     assert caught.value.field == "width"
+
+
+def test_a_second_camera_has_the_scores_of_the_simulators_own_clip(
+    rendered: Path, tmp_path: Path
+) -> None:
+    simulated, clip = open_capture(rendered), _clip(rendered)
+    # The scene's own camera films the hands of the clip; its pixels are not looked at.
+    count = len(clip)
+    cameras = Cameras(*(np.repeat(a[:1], count, axis=0) for a in vars(simulated.cameras).values()))
+    info = replace(clip.info, id="front", digests=None)
+    with CaptureWriter(tmp_path / "front", info, clip.hands, cameras) as writer:
+        for frame in range(count):
+            writer.frame(frame, np.zeros((SIZE, SIZE, 3), np.uint8))
+            writer.mask(frame, np.full((SIZE, SIZE), 255, np.uint8))
+    front = open_capture(tmp_path / "front")
+    made = add_second_view(front, clip)
+    assert (made.scale, made.distance_px, len(made.frames)) == (None, 0.0, count)
+    real = _clip(front.root)
+    for name in ("frames", "masks", "true_masks", "cameras", "hands"):
+        assert (real.info.digests or {})[name] == (clip.info.digests or {})[name]
+    folder = tmp_path / "drawn"
+    folder.mkdir()
+    rng = np.random.default_rng(0)
+    for frame in range(count):
+        drawn = rng.integers(0, 255, (SIZE, SIZE, 3), np.uint8)
+        cv2.imwrite(str(folder / f"{frame:06d}.png"), drawn)
+    scores = [
+        score_frames_of(read_targets(one, range(count)), folder, one.size).scores
+        for one in (real, clip)
+    ]
+    assert scores[0] == scores[1]
+    assert all(frame.failure is None for frame in scores[0])
