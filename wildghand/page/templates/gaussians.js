@@ -42,13 +42,13 @@ void main() {
   }
   dark = vec4(pow(clamp(lit / whole, 0.15, 1.0), 1.0 / 2.2));
 }`;
-// Texels of a Gaussian: 0 corners and the first share; 1 second share, unused, what is kept
-// of offset and shape; 2 to 5 attributes and uv; 6 place and mean weight; 7 shift, whether seen.
+// Texels of a Gaussian: 0 corners and the first share; 1 second share, whether it is near a wrist's
+// border, what is kept of offset and shape; 2 to 5 attributes and uv; 6 place and mean weight; 7 shift, whether seen.
 const POSE = (P, H, first, second) => `${GLSL}
 layout(std140) uniform First { vec4 one[${first}]; };
 layout(std140) uniform Second { vec4 two[${second}]; };
 vec4 weight(int i) { return i < ${first} ? one[i] : two[i - ${first}]; }
-uniform int start, skin; uniform bool networked, biased; uniform vec4 posture[${P}];
+uniform int start, skin, middle; uniform bool networked, biased; uniform vec4 posture[${P}];
 uniform vec4 disc[4], activation;
 uniform ivec2 lamps; uniform vec2 ambient; uniform vec4 cap; uniform vec3 eye;
 uniform vec4 mixing[56], shift[4], fields[32]; uniform vec3 gain;
@@ -211,6 +211,16 @@ void main() {
     2.0 * (q.y * q.z - q.x * q.w), 1.0 - 2.0 * (q.y * q.y + q.w * q.w), 2.0 * (q.z * q.w + q.x * q.y),
     2.0 * (q.y * q.w + q.x * q.z), 2.0 * (q.z * q.w - q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z));
   mat3 half_ = mat3(turn[0] * scales.x, turn[1] * scales.y, turn[2] * scales.z);
+  // wildghand/model/wrist.py: skin of a wrist ends before the plane of its border.
+  if (middle >= 0 && texel(gaussians, t + 1).y > 0.0) {
+    vec3 n = texel(vertices, 2 * middle + 1).xyz;
+    float depth = dot(mean - texel(vertices, 2 * middle).xyz, n), room = max(depth, 3e-4);
+    float kept = room / max(3.0 * length(n * half_), 1e-9);
+    if (kept < 1.0) {
+      mean += (room - depth) * n;
+      half_ -= (1.0 - kept) * outerProduct(n, n * half_);
+    }
+  }
   mat3 S = half_ * transpose(half_);
   a = vec4(mean, 1.0 / (1.0 + exp(-raw[2].z)));
   b = vec4(S[0][0], S[0][1], S[0][2], S[1][1]);
@@ -325,6 +335,7 @@ class Gaussians {
         const weight = trusted && trusted[n] < 255 ? trusted[n] / 254 : 2;
         out.set([weight, ...shifts.subarray(3 * n, 3 * n + 3), Math.min(k / Math.max(1 - k, 1e-6), 1)], o + 27);
       }
+      for (const n of data.lenders) out[32 * (row + n) + 5] = 1;
       row += hand.count;
       vertex += hand.vertices;
     }
@@ -415,6 +426,8 @@ class Gaussians {
     const at = this.use(this.poser, ["gaussians", "vertices", "lights", "darks", "bones"]);
     gl.uniform1i(at("start"), hand.first);
     gl.uniform1i(at("skin"), hand.skin);
+    const middle = hand.border.length && !biased ? hand.firstVertex + hand.rest.length / 3 : -1;
+    gl.uniform1i(at("middle"), middle);
     gl.uniform1i(at("networked"), network ? 1 : 0);
     if (network) gl.uniform4fv(at("posture"), this.postureOf(pose.vectors));
     gl.uniform4fv(at("disc"), [...hand.data.disc, 0, 0]);
