@@ -252,8 +252,7 @@ _PAGE_EXAMPLES = """examples:
   wildghand page my_avatar --poses my_capture -o hand.html
 
 Writes one HTML file that works offline in a browser with WebGL2: the hand can be turned and posed.
-With the capture that was fitted its motion is played, too, and the page says how near it comes to
-the avatar's own drawing.
+With the capture that was fitted its motion is played, too.
 """
 
 
@@ -285,11 +284,6 @@ def do_page(args: argparse.Namespace) -> int:
         print_json(dataclasses.asdict(facts))
         return 0
     print(f"{args.out}: {facts.gaussians} Gaussians, {facts.bytes / 1e6:.2f} MB")
-    if facts.fidelity is not None:
-        print(
-            f"{facts.fidelity.baked:.1f} dB from the avatar's own drawing "
-            f"({facts.fidelity.joints_only:.1f} dB if it followed the joints alone)"
-        )
     return 0
 
 

@@ -102,10 +102,10 @@ class HandShadows:
         self._darkest = darkest
         self._templates = {side: _on_cpu(rig.template) for side, rig in rigs.items()}
         self._faces = {side: made.faces.numpy() for side, made in self._templates.items()}
-        self._light = light.lit()
+        self.light = light.lit()
         device = next(iter(rigs.values())).template.vertices.device
-        self._directions = torch.from_numpy(self._light.directions).to(device).double()
-        self._strengths = torch.from_numpy(self._light.strengths).to(device).double()
+        self._directions = torch.from_numpy(self.light.directions).to(device).double()
+        self._strengths = torch.from_numpy(self.light.strengths).to(device).double()
         self._corners: dict[str, tuple[Tensor, Tensor]] = {}
         for side, rig in rigs.items():
             faces = torch.as_tensor(rig.anchors.face_index, device=rig.template.faces.device)
@@ -131,7 +131,7 @@ class HandShadows:
                 for one in normals
             ]
         )
-        return (falling + self._light.ambient).clamp(_DIM, _BRIGHT).pow(SRGB).to(normals)
+        return (falling + self.light.ambient).clamp(_DIM, _BRIGHT).pow(SRGB).to(normals)
 
     def of(self, hands: Hands) -> dict[str, Tensor]:
         """Factors on the sRGB colours of the Gaussians of hands that stand together.
@@ -161,8 +161,8 @@ class HandShadows:
         return dark
 
     def _dark(self, in_the_way: Obstacles, places: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        free = in_the_way.free(places, normals, self._light.directions)
-        return self._light.darkening(normals, free, self._darkest)
+        free = in_the_way.free(places, normals, self.light.directions)
+        return self.light.darkening(normals, free, self._darkest)
 
     def _posed(
         self, side: str, pose: Tensor, betas: Tensor, transl: Tensor

@@ -22,11 +22,12 @@ from wildghand.gaussians.quaternions import matrix_to_quat, quat_rotate
 from wildghand.gaussians.rig import HandRig
 from wildghand.model.dress import Gaussians
 
-# m: the distance between discs, how deep they lie in the hand, and how far along the skin, from the
-# border, Gaussians lend them their colour.
-_SPACING, _DEPTH, _NEAR = 0.002, 0.002, 0.025
-# A disc's standard deviations along the wall and across it, in spacings, and its opacity.
-_WIDE, _THIN, _OPAQUE = 0.7, 0.2, 0.98
+#: m: the distance between discs, and how deep they lie in the hand.
+SPACING, DEPTH = 0.002, 0.002
+# How far along the skin, from the border, Gaussians lend them their colour, m.
+_NEAR = 0.025
+#: A disc's standard deviations along the wall and across it, in spacings, and its opacity.
+WIDE, THIN, OPAQUE = 0.7, 0.2, 0.98
 # m: no wrist is wider; the subject of a damaged avatar may be.
 _WIDEST = 0.2
 # Standard deviations of a disc between its centre and the border: it does not show from outside.
@@ -80,18 +81,18 @@ class WristWall:
         vertices = pose_hand(self.template, pose, betas, transl).vertices
         border = vertices[:, self.border]
         spokes, normal = self.plane(vertices)
-        means = self.shares @ border + _DEPTH * normal[:, None]
+        means = self.shares @ border + DEPTH * normal[:, None]
         along = normalize(spokes[:, 0] - (spokes[:, 0] * normal).sum(-1, True) * normal, dim=-1)
         axes = torch.stack([along, torch.linalg.cross(normal, along), normal], dim=-1)
         count = len(self)
         colors = hand.colors[..., self.skin, :].median(dim=-2, keepdim=True).values
-        scales = _SPACING * means.new_tensor([_WIDE, _WIDE, _THIN])
+        scales = SPACING * means.new_tensor([WIDE, WIDE, THIN])
         return replace(
             hand,
             means=means,
             quats=matrix_to_quat(axes)[:, None].expand(-1, count, -1),
             scales=scales.expand(*hand.scales.shape[:-2], count, 3),
-            opacities=means.new_full((*hand.opacities.shape[:-1], count), _OPAQUE),
+            opacities=means.new_full((*hand.opacities.shape[:-1], count), OPAQUE),
             colors=colors.expand(*colors.shape[:-2], count, 3),
         )
 
@@ -168,12 +169,12 @@ def _fan(border: np.ndarray) -> np.ndarray:
     spokes = border - centre
     plane = np.linalg.svd(spokes, full_matrices=False)[2][:2]
     flat = spokes @ plane.T
-    reach = np.arange(0.0, np.abs(flat).max() + _SPACING, _SPACING)
+    reach = np.arange(0.0, np.abs(flat).max() + SPACING, SPACING)
     line = np.concatenate([-reach[:0:-1], reach])
     grid = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
     closed = flat.astype(np.float32)
     depths = [cv2.pointPolygonTest(closed, point, True) for point in grid.tolist()]
-    grid = grid[np.array(depths) >= _INSIDE * _WIDE * _SPACING]
+    grid = grid[np.array(depths) >= _INSIDE * WIDE * SPACING]
     after = np.roll(flat, -1, axis=0)
     # grid = a flat + b after, in each triangle.
     weights = np.einsum("lij,pj->pli", np.linalg.pinv(np.stack([flat, after], axis=-1)), grid)

@@ -1,5 +1,3 @@
-from .bake import BakedHand as BakedHand
-from .bake import bake_hand as bake_hand
 from .write import PageFacts as PageFacts
 from .write import PageSettings as PageSettings
 from .write import show_page as show_page

@@ -1,44 +1,318 @@
-"""Gaussians of one hand without its network: skinned, plus what depends linearly on the pose.
+"""Content of a page: a hand's surface, its Gaussians, and the layers of the model that see a pose.
 
-The network's offsets and colours depend on the pose, and a page cannot run the network. In many
-poses the Gaussians are therefore drawn by the avatar and taken back into the rest pose by linear
-blend skinning. There remain a mean, and deviations. Of these the principal components are kept,
-and their coefficients are regressed on the rotations of the 16 joints.
+Most of a compact network sees no pose: for each Gaussian it comes down to 14 numbers. What does
+see the pose (the geometry branch and what the heads make of it) is a few small layers, which the
+page evaluates at each Gaussian. A network that is too large for that is drawn in many poses
+instead, and what it says becomes a mean and principal components, whose coefficients are regressed
+on the rotations of the joints (`PoseBasis`).
 """
 
 from __future__ import annotations
 
+import base64
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor, nn
 
-from hwp_bench.hands import anchor_normals, pose_hand
 from hwp_bench.hands.articulation import axis_angle_to_matrix
-from hwp_bench.hands.skeleton import PARENTS
-from hwp_bench.methods.contract import HandPose
-from wildghand.avatar import PosedGaussians, WildGHandAvatar
-from wildghand.gaussians.rig import HandRig
-from wildghand.model.dress import Gaussians
-from wildghand.model.wrist import WristWall
+from wildghand.avatar import WildGHandAvatar
+from wildghand.gaussians.attributes import CHANNELS, RawAttributes
+from wildghand.model.wrist import DEPTH, OPAQUE, SPACING, THIN, WIDE, WristWall
+from wildghand.network import HandFeatures
+from wildghand.network.branches import CompactGeometry
+from wildghand.network.surface import Chart
 from wildghand.splat.threads import denormals_flushed
+from wildghand.visibility import Visibility
 
-#: Joints that move one Gaussian at most.
-INFLUENCES = 4
 # Weights of the ridge that are tried, per sample, and parts that are left out in turn.
 _RIDGES, _FOLDS = (1e-3, 1e-2, 1e-1, 1.0), 4
+# Harmonics of the normal, padded to fours, and vectors of four weights that every browser takes
+# in two blocks.
+_HARMONICS, _MOST_WEIGHTS = 16, 2048
+# Components of a hand model's pose correctives that are kept, their bytes, and joints of a vertex.
+_CORRECTIVES, _MOST_CORRECTIVES, _JOINTS = 32, 1_000_000, 4
+# Poses that are asked for together.
+_CHUNK = 8
+
+
+def pack(array: np.ndarray) -> str:
+    """Base64 of an array's bytes."""
+    return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode()
+
+
+def pack_whole(values: np.ndarray) -> dict[str, Any]:
+    """(N, C) numbers in 16 bits each: `low` + `step` * whole, by column."""
+    low = values.min(axis=0).astype(np.float64)
+    step = np.maximum(values.max(axis=0) - low, 1e-12) / 65535.0
+    whole = np.rint((values - low) / step).clip(0, 65535).astype("<u2")
+    return {"low": low.tolist(), "step": step.tolist(), "whole": pack(whole)}
+
+
+@torch.no_grad()
+def network_content(avatar: WildGHandAvatar) -> dict[str, Any] | None:
+    """The layers that see a pose, as the page's shader reads them; None where they are too large.
+
+    Vectors of four outputs follow one another, input by input; missing inputs and outputs are 0.
+    """
+    network = avatar.model.network
+    branch, head, dark = network.geometry_branch, network.attribute_head, network.shadow_head
+    if not isinstance(branch, CompactGeometry) or network.settings.head_layers != 1:
+        return None
+    width, heads = branch.mix.out_features, network.settings.head_width
+    points, hidden = -(-width // 4), -(-heads // 4)
+    harmonics = branch.channels - width
+    of_hidden = _first(head.geometry), _first(dark.detail)
+    last = dark.detail[-1]
+    assert isinstance(last, nn.Linear)
+
+    def geometry(weight: Tensor) -> Tensor:
+        """Columns of harmonics and hidden features, each padded."""
+        light, rest = weight.split([harmonics, width], dim=1)
+        return torch.cat([_wider(light, _HARMONICS), _wider(rest, 4 * points)], dim=1)
+
+    def rows(*weights: Tensor, quads: int) -> Tensor:
+        """(inputs, 4 quads) of (outputs, inputs) weights."""
+        return torch.cat([_wider(weight.T, 4 * quads) for weight in weights], dim=1)
+
+    several = [
+        rows(branch.place.weight, quads=points),
+        rows(_wider(branch.normal.weight, _HARMONICS), quads=points),
+        rows(branch.mix.bias[:, None], quads=points),
+        rows(_wider(branch.mix.weight, 4 * points), quads=points),
+        rows(*(layer.bias[:, None] for layer in of_hidden), quads=hidden),
+        rows(*(geometry(layer.weight) for layer in of_hidden), quads=hidden),
+        rows(_wider(head.attributes.weight, 4 * hidden), quads=4),
+        _wider((last.bias + dark.start)[None], 4),
+        _wider(last.weight, 4 * hidden),
+        geometry(dark.light.weight),
+    ]
+    weights = torch.cat([part.reshape(-1, 4) for part in several])
+    if len(weights) > _MOST_WEIGHTS:
+        return None
+    return {
+        "points": points,
+        "hidden": hidden,
+        "weights": _real(weights),
+        "frequencies": branch.frequencies,
+        "posture": _real(_wider(branch.pose.weight.T, 4 * points)),
+        "bias": _wider(branch.place.bias[None], 4 * points)[0].tolist(),
+    }
+
+
+def _first(layers: nn.Sequential) -> nn.Linear:
+    layer = layers[0]
+    assert isinstance(layer, nn.Linear)
+    return layer
+
+
+def _wider(matrix: Tensor, columns: int) -> Tensor:
+    return nn.functional.pad(matrix, (0, columns - matrix.shape[1]))
+
+
+def _real(values: Tensor | np.ndarray) -> str:
+    array = values.detach().cpu().numpy() if isinstance(values, Tensor) else values
+    return pack(array.astype("<f4"))
+
+
+def light_content(avatar: WildGHandAvatar) -> dict[str, Any]:
+    """The light that casts shadows, and the one by which unknown normals are drawn."""
+    model = avatar.model
+    cast = None if model.shadows is None else model.shadows.light
+    known = model.light
+    content: dict[str, Any] = {"cast": None, "known": None}
+    if cast is not None and len(cast.strengths):
+        lamps = np.column_stack([cast.directions, cast.strengths])
+        content["cast"] = {"lamps": lamps.tolist(), "ambient": cast.ambient}
+    if known is not None:
+        lamps = torch.column_stack([known.directions, known.strengths]).cpu().numpy()
+        content["known"] = {
+            "lamps": lamps.tolist(),
+            "ambient": float(known.ambient),
+            "cap": [*known.axis.tolist(), float(known.cosine)],
+        }
+    return content
+
+
+@denormals_flushed()
+@torch.no_grad()
+def hand_content(
+    avatar: WildGHandAvatar, side: str, poses: np.ndarray, *, tabled: bool, rank: int
+) -> dict[str, Any]:
+    """One hand; lengths in m. The discs that close the open end of its wrist come last.
+
+    Args:
+        poses: (P, 16, 3) rad, from which is learnt what only follows from the pose.
+        tabled: the network is too large for the page.
+        rank: principal components of what such a network says.
+    """
+    model, settings = avatar.model, avatar.settings
+    rig, network, wall = model.rigs[side], model.network, model.wall(side)
+    features = network.features(side)
+    betas = torch.as_tensor(avatar.betas[side], dtype=torch.float32).to(features.betas)
+    steps, said = _sample(avatar, side, poses, features, tabled=tabled)
+    shape = betas + features.betas if settings.heads else betas
+    template = rig.template
+    rest = template.vertices + template.shape_basis @ shape
+    faces = template.faces.cpu().numpy()
+    corners = faces[torch.as_tensor(rig.anchors.face_index).cpu().numpy()]
+    mix = torch.as_tensor(rig.anchors.barycentric).cpu().numpy()
+    count = len(rig)
+    if tabled:
+        base = said.mean(axis=0)[:, :CHANNELS]
+    else:
+        raw = network.attributes_of_texture(side, features)
+        if model.color_changes is not None:
+            raw = model.color_changes.color(side, raw)
+        base = raw.concatenate().cpu().numpy()
+    shifts = np.zeros((count, 3))
+    if settings.heads:
+        shifts = features.template_offsets.cpu().numpy()
+    kept = np.ones((count, 2))
+    if model.visibility is not None:
+        both = model.visibility.offsets[side], model.visibility.shapes[side]
+        kept = torch.stack(both, dim=1).cpu().numpy()
+    chart = network.charts[side]
+    assert isinstance(chart, Chart)
+    coded = chart.coordinates.double().cpu().numpy()
+    # uv, and the angle of the lowest frequency of each coordinate (`encode_positions`).
+    places = np.concatenate([coded[:, :2], np.arctan2(coded[:, 2:11:3], coded[:, 11:20:3])], axis=1)
+    if wall is not None:
+        discs = _wall_rows(wall, len(rest), network.activation.log_scale_bias)
+        corners = np.concatenate([corners, discs.corners])
+        mix = np.concatenate([mix, discs.mix])
+        base = np.concatenate([base, discs.base])
+        shifts = np.concatenate([shifts, discs.shifts])
+        # These are as they are: no frame is asked.
+        kept = np.concatenate([kept, np.ones((len(wall), 2))])
+    order = torch.argsort(template.weights, dim=1, descending=True)[:, :_JOINTS].cpu().numpy()
+    weights = np.take_along_axis(template.weights.cpu().numpy(), order, axis=1)
+    return {
+        "side": side,
+        "skin": count,
+        "count": len(base),
+        "joints": (template.joints + template.joint_basis @ shape).tolist(),
+        "rest": _real(rest),
+        "bones": pack(order.astype(np.uint8)),
+        "weights": _real(weights / weights.sum(axis=1, keepdims=True)),
+        "faces": pack(faces.astype("<u4")),
+        "correctives": pack_correctives(template.pose_basis),
+        "border": [] if wall is None else wall.border.tolist(),
+        "lenders": [] if wall is None else wall.skin.tolist(),
+        "corners": pack(corners.astype("<u2")),
+        "mix": pack(np.rint(mix[:, :2] * 65535.0).astype("<u2")),
+        "base": pack_whole(base),
+        "places": pack_whole(places),
+        "shifts": pack_whole(shifts),
+        "kept": pack(np.rint(kept * 255.0).astype(np.uint8)),
+        "disc": _disc(avatar, side),
+        "activation": [
+            network.activation.max_offset,
+            network.activation.log_scale_bias,
+            math.log(network.activation.min_scale),
+            math.log(network.activation.max_scale),
+        ],
+        "steps": None if steps is None else _real(_ridge(pose_features(poses), steps)),
+        "table": pose_basis(said, poses, rank).content() if tabled else None,
+    }
+
+
+def _sample(
+    avatar: WildGHandAvatar,
+    side: str,
+    poses: np.ndarray,
+    features: HandFeatures,
+    *,
+    tabled: bool,
+) -> tuple[np.ndarray | None, np.ndarray]:
+    """In P poses: (P, 51) corrections of pose and translation, None without; and what is tabled.
+
+    That is (P, N, 15): the attributes before their activation, and the log of the shadow.
+    """
+    model, rig = avatar.model, avatar.model.rigs[side]
+    betas = torch.as_tensor(avatar.betas[side], dtype=torch.float32).to(features.betas)
+    steps, said = [], []
+    for part in torch.as_tensor(poses, dtype=torch.float32).to(betas).split(_CHUNK):
+        anchors = rig.pose(part, betas, part.new_zeros(len(part), 3))
+        made = model.predict(side, anchors, part, features)
+        steps.append(torch.cat([made.refinement.pose.flatten(1), made.refinement.transl], dim=1))
+        if tabled:
+            raw = made.raw
+            if model.color_changes is not None:
+                raw = model.color_changes.color(side, raw)
+            log = made.shadow.clamp(min=1e-4).log()
+            said.append(torch.cat([raw.concatenate(), log], dim=-1).cpu().numpy())
+    found = torch.cat(steps).cpu().numpy() if avatar.settings.heads else None
+    return found, np.concatenate(said) if said else np.zeros((0, len(rig), CHANNELS + 1))
+
+
+def _disc(avatar: WildGHandAvatar, side: str) -> list[float]:
+    """(14,) attributes of a Gaussian of which no frame says anything."""
+    rig, none = avatar.model.rigs[side], {side: torch.zeros(1)}
+    blank = RawAttributes.split(torch.zeros(1, CHANNELS))
+    bias = avatar.model.network.activation.log_scale_bias
+    return Visibility(none, none).settle(side, blank, rig.spacing, bias).concatenate()[0].tolist()
+
+
+@dataclass(frozen=True, eq=False)
+class _WallRows:
+    """The M discs of a wall as anchors on triangles of its middle and two of its border."""
+
+    #: (M, 3) numbers of vertices: the middle follows those of the hand, and then the border.
+    corners: np.ndarray
+    #: (M, 3).
+    mix: np.ndarray
+    #: (M, 14) attributes before their activation.
+    base: np.ndarray
+    #: (M, 3) m in the frame of the triangle, whose normal points into the hand.
+    shifts: np.ndarray
+
+
+def _wall_rows(wall: WristWall, vertices: int, log_scale_bias: float) -> _WallRows:
+    shares = wall.shares.double().cpu().numpy()
+    least = shares.min(axis=1, keepdims=True)
+    pair = np.argsort(shares, axis=1)[:, -2:]
+    rest = np.take_along_axis(shares - least, pair, axis=1)
+    corners = np.concatenate([np.full((len(wall), 1), vertices), vertices + 1 + pair], axis=1)
+    size = [math.log(SPACING * each) - log_scale_bias for each in (WIDE, WIDE, THIN)]
+    opacity = math.log(OPAQUE / (1.0 - OPAQUE))
+    row = [0.0, 0.0, 0.0, *size, 1.0, 0.0, 0.0, 0.0, opacity, 0.0, 0.0, 0.0]
+    return _WallRows(
+        corners,
+        np.concatenate([least * shares.shape[1], rest], axis=1),
+        np.tile(row, (len(wall), 1)),
+        np.tile([0.0, 0.0, DEPTH], (len(wall), 1)),
+    )
+
+
+def pack_correctives(basis: Tensor | None) -> dict[str, Any] | None:
+    """Principal components of (V, 3, 135) pose correctives; a page needs no more of them."""
+    if basis is None:
+        return None
+    flat = basis.flatten(0, 1).double().cpu().numpy()
+    left, sizes, right = np.linalg.svd(flat, full_matrices=False)
+    count = min(_CORRECTIVES, max(8, _MOST_CORRECTIVES // len(flat)))
+    left, sizes, right = left[:, :count].T, sizes[:count, None], right[:count]
+    peaks = np.abs(left).max(axis=1, keepdims=True)
+    return {
+        "basis": pack(np.rint(left / peaks * 127.0).astype(np.int8)),
+        "map": _real(peaks / 127.0 * sizes * right),
+    }
 
 
 @dataclass(frozen=True, eq=False)
 class PoseBasis:
-    """N vectors that depend on a pose: mean + sum over k of c_k basis_k."""
+    """N vectors of C numbers that depend on a pose: mean + sum over k of c_k basis_k."""
 
-    #: (N, 3).
+    #: (N, C).
     mean: np.ndarray
-    #: (K, N, 3) int8.
+    #: (K, N, C) int8.
     basis: np.ndarray
-    #: (K,) by which the basis is multiplied.
+    #: (K, C) by which the basis is multiplied.
     steps: np.ndarray
     #: (145, K): rotations of 16 joints, row by row, and a constant, to coefficients.
     regression: np.ndarray
@@ -46,176 +320,44 @@ class PoseBasis:
     bounds: np.ndarray
 
     def at(self, pose: np.ndarray) -> np.ndarray:
-        """(N, 3) in a pose, (16, 3) rad."""
+        """(N, C) in a pose, (16, 3) rad."""
         found = pose_features(pose[None]) @ self.regression
-        coefficients = np.clip(found[0], *self.bounds) * self.steps
-        return self.mean + np.einsum("k,knc->nc", coefficients, self.basis)
+        coefficients = np.clip(found[0], *self.bounds)[:, None] * self.steps
+        return self.mean + np.einsum("kc,knc->nc", coefficients, self.basis)
+
+    def content(self) -> dict[str, Any]:
+        """As the page reads it."""
+        return {
+            "mean": _real(self.mean),
+            "basis": pack(self.basis),
+            "steps": self.steps.tolist(),
+            "regression": _real(self.regression),
+            "bounds": self.bounds.tolist(),
+        }
 
 
-@dataclass(frozen=True, eq=False)
-class BakedHand:
-    """One hand with N Gaussians, as a page knows it; lengths in m, colours in sRGB.
-
-    Those of the wall that closes the open end of the wrist come last.
-    """
-
-    #: (16, 3) rest joints of this person.
-    joints: np.ndarray
-    #: (N, 4) uint8 joints that move a Gaussian, and (N, 4) their weights, of sum 1.
-    influences: np.ndarray
-    weights: np.ndarray
-    #: Places in the rest pose.
-    means: PoseBasis
-    #: Colours as drawn, with the light of the clip.
-    colors: PoseBasis
-    #: (N, 6) covariance in the rest pose: xx, xy, xz, yy, yz, zz.
-    covariances: np.ndarray
-    #: (N,) in (0, 1).
-    opacities: np.ndarray
-    #: (N, 3) unit, in the rest pose.
-    normals: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.opacities)
-
-    def posed(self, pose: np.ndarray, transl: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Do in NumPy as the page does: means (N, 3), covariances (N, 3, 3), colours (N, 3)."""
-        linear, shifts = self.motions(pose, transl)
-        means = np.einsum("nij,nj->ni", linear, self.means.at(pose)) + shifts
-        xx, xy, xz, yy, yz, zz = self.covariances.T
-        rest = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3)
-        return means, linear @ rest @ linear.swapaxes(1, 2), self.colors.at(pose)
-
-    def motions(self, pose: np.ndarray, transl: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Blended motions of the Gaussians: (N, 3, 3) and (N, 3) m."""
-        return blended_motions(self.joints, self.influences, self.weights, pose, transl)
-
-
-def blended_motions(
-    joints: np.ndarray,
-    influences: np.ndarray,
-    weights: np.ndarray,
-    pose: np.ndarray,
-    transl: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Linear blend skinning of points by the joints that move them; see `BakedHand.motions`."""
-    turns, shifts = joint_motions(joints, pose, transl)
-    linear = np.einsum("nk,nkij->nij", weights, turns[influences])
-    return linear, np.einsum("nk,nki->ni", weights, shifts[influences])
-
-
-def joint_motions(
-    joints: np.ndarray, pose: np.ndarray, transl: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Rotations (16, 3, 3) and shifts (16, 3) m of the joints, as `hwp_bench.hands.pose_hand`."""
-    turns = _rotations(pose)
-    places = joints.copy()
-    for joint, parent in enumerate(PARENTS):
-        if parent >= 0:
-            places[joint] = places[parent] + turns[parent] @ (joints[joint] - joints[parent])
-            turns[joint] = turns[parent] @ turns[joint]
-    return turns, places + transl - np.einsum("jik,jk->ji", turns, joints)
+def pose_basis(values: np.ndarray, poses: np.ndarray, rank: int) -> PoseBasis:
+    """Principal components of (P, N, C) values in P poses, and their regression on these."""
+    mean = values.mean(axis=0, dtype=np.float64)
+    flat = (values - mean).reshape(len(values), -1)
+    # The Gram matrix is small: there are fewer poses than Gaussians.
+    power, vectors = np.linalg.eigh(flat @ flat.T)
+    order = np.argsort(power)[::-1][: min(rank, len(values) - 1)]
+    order = order[power[order] > 1e-9 * max(float(power.max()), 1e-30)]
+    roots = np.sqrt(power[order])
+    components = (flat.T @ (vectors[:, order] / roots)).T.reshape(len(order), *mean.shape)
+    coefficients = vectors[:, order] * roots
+    peaks = np.abs(components).max(axis=1, initial=1e-30)
+    whole = np.rint(components / peaks[:, None] * 127.0).astype(np.int8)
+    bounds = np.stack([coefficients.min(axis=0), coefficients.max(axis=0)])
+    return PoseBasis(mean, whole, peaks / 127.0, _ridge(pose_features(poses), coefficients), bounds)
 
 
 def pose_features(poses: np.ndarray) -> np.ndarray:
     """(P, 145) rotations of the joints of (P, 16, 3) rad, row by row, and a one."""
-    turns = _rotations(poses.reshape(-1, 3)).reshape(len(poses), -1)
+    vectors = torch.as_tensor(np.array(poses, dtype=np.float64)).reshape(-1, 3)
+    turns = axis_angle_to_matrix(vectors).numpy().reshape(len(poses), -1)
     return np.concatenate([turns, np.ones((len(poses), 1))], axis=1)
-
-
-@denormals_flushed()
-@torch.no_grad()
-def bake_hand(
-    avatar: WildGHandAvatar, side: str, poses: np.ndarray, *, geometry_rank: int, color_rank: int
-) -> BakedHand:
-    """Bake one hand from its Gaussians in poses (P, 16, 3); covariances are of the first."""
-    rig, betas = avatar.model.rigs[side], avatar.betas[side]
-    shape = torch.as_tensor(betas, dtype=torch.float32, device=rig.template.joints.device)
-    joints = (rig.template.joints + rig.template.joint_basis @ shape).double().cpu().numpy()
-    wall = avatar.model.wall(side)
-    influences, weights = _skin(rig, wall)
-    gaussians = []
-    for pose in poses:
-        hand = HandPose(side, pose, betas, np.zeros(3))
-        gaussians.append(avatar.pose({side: hand}, closed=True))
-        gaussians[-1].require_finite()
-    rest = np.empty((len(poses), len(influences), 3), dtype=np.float32)
-    for row, (pose, drawn) in enumerate(zip(poses, gaussians, strict=True)):
-        linear, shifts = blended_motions(joints, influences, weights, pose, np.zeros(3))
-        rest[row] = np.linalg.solve(linear, (drawn.means - shifts)[..., None])[..., 0]
-    linear, _ = blended_motions(joints, influences, weights, poses[0], np.zeros(3))
-    inverse = np.linalg.inv(linear)
-    covariance = inverse @ _covariances(gaussians[0]) @ inverse.swapaxes(1, 2)
-    rows, columns = np.triu_indices(3)
-    colors = np.stack([drawn.colors for drawn in gaussians])
-    return BakedHand(
-        joints=joints,
-        influences=influences,
-        weights=weights,
-        means=_basis(rest, poses, geometry_rank),
-        colors=_basis(colors, poses, color_rank),
-        covariances=covariance[:, rows, columns],
-        opacities=np.mean([drawn.opacities for drawn in gaussians], axis=0),
-        normals=_rest_normals(rig, wall, shape),
-    )
-
-
-def _rotations(vectors: np.ndarray) -> np.ndarray:
-    return axis_angle_to_matrix(torch.as_tensor(np.array(vectors, dtype=np.float64))).numpy()
-
-
-def _skin(rig: HandRig, wall: WristWall | None) -> tuple[np.ndarray, np.ndarray]:
-    faces, anchors = rig.template.faces.cpu(), rig.anchors
-    corners = faces[torch.as_tensor(anchors.face_index).cpu()]
-    mix = torch.as_tensor(anchors.barycentric).cpu()
-    by_vertex = rig.template.weights.cpu()
-    weights = (by_vertex[corners] * mix[..., None]).sum(dim=1)
-    if wall is not None:
-        border = wall.shares.cpu() @ by_vertex[wall.border.cpu()]
-        weights = torch.cat([weights, border.to(weights)])
-    kept, joints = weights.topk(INFLUENCES, dim=1)
-    kept = kept / kept.sum(dim=1, keepdim=True)
-    # As the page stores them, so that both compute the same.
-    whole = np.rint(kept.double().numpy() * 65535.0)
-    return joints.numpy().astype(np.uint8), whole / whole.sum(axis=1, keepdims=True)
-
-
-def _rest_normals(rig: HandRig, wall: WristWall | None, shape: torch.Tensor) -> np.ndarray:
-    zeros = shape.new_zeros(1, 16, 3), shape, shape.new_zeros(1, 3)
-    vertices = pose_hand(rig.template, *zeros).vertices
-    normals = anchor_normals(vertices, rig.template.faces, rig.anchors)[0].cpu().numpy()
-    if wall is None:
-        return normals
-    _, inwards = wall.plane(vertices)
-    outwards = -inwards.cpu().numpy().repeat(len(wall), axis=0)
-    return np.concatenate([normals, outwards])
-
-
-def _covariances(gaussians: PosedGaussians) -> np.ndarray:
-    w, x, y, z = gaussians.quats.astype(np.float64).T
-    turn = np.stack(
-        [
-            *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-            *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-            *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-        ],
-        axis=1,
-    ).reshape(-1, 3, 3)
-    scales = np.broadcast_to(gaussians.scales, gaussians.means.shape).astype(np.float64)
-    half = turn * scales[:, None]
-    return half @ half.swapaxes(1, 2)
-
-
-def _basis(values: np.ndarray, poses: np.ndarray, rank: int) -> PoseBasis:
-    """Principal components of (P, N, 3) values in P poses, and their regression on these."""
-    count = len(values)
-    mean = values.mean(axis=0, dtype=np.float64)
-    components, coefficients = _principal(values - mean, min(rank, count - 1))
-    peaks = np.abs(components).max(axis=(1, 2), initial=1e-30)
-    regression = _ridge(pose_features(poses), coefficients)
-    bounds = np.stack([coefficients.min(axis=0), coefficients.max(axis=0)])
-    whole = np.rint(components / peaks[:, None, None] * 127.0).astype(np.int8)
-    return PoseBasis(mean, whole, peaks / 127.0, regression, bounds)
 
 
 def _ridge(features: np.ndarray, targets: np.ndarray) -> np.ndarray:
@@ -241,100 +383,32 @@ def _ridge(features: np.ndarray, targets: np.ndarray) -> np.ndarray:
     return solve(features, targets, best)
 
 
-#: Numbers of a Gaussian: place at rest (3, m), colour (3, sRGB), opacity, log of the scale.
-WIDTH = 8
-# How much of each number the eye takes for about as much: 4 mm, a quarter of the colours.
-_UNITS = np.array([0.004] * 3 + [0.25] * 3 + [0.25, 0.5])
-# Frames that are posed together.
-_CHUNK = 8
-
-
-@dataclass(frozen=True, eq=False)
-class FrameBiases:
-    """Additions of F frames to the N Gaussians of a hand: the sum over k of c_fk basis_k."""
-
-    #: (K, N, 8) int8.
-    basis: np.ndarray
-    #: (K, 8) by which the basis is multiplied.
-    steps: np.ndarray
-    #: (F, K).
-    coefficients: np.ndarray
-
-    def at(self, row: int) -> np.ndarray:
-        """(N, 8) that frame number `row` of F adds."""
-        scaled = self.coefficients[row][:, None] * self.steps
-        return np.einsum("kc,knc->nc", scaled, self.basis)
-
-
-@denormals_flushed()
 @torch.no_grad()
-def bake_biases(
-    avatar: WildGHandAvatar,
-    side: str,
-    hand: BakedHand,
-    frames: Sequence[int],
-    motion: np.ndarray,
-    rank: int,
-) -> FrameBiases | None:
-    """Bake the biases of F training frames, with their poses and translations (F, 51).
+def biases_content(
+    avatar: WildGHandAvatar, side: str, frames: Sequence[int]
+) -> dict[str, Any] | None:
+    """What DPD adds to the attributes g in F frames: omega (A g + shift + field), and the gain.
 
-    None where the avatar has none.
+    None where the avatar has no biases. The field is linear in how far each bone moves a place and
+    in the harmonics of its normal (`wildghand.dpd.BiasField`).
     """
     model = avatar.model
-    if side not in model.perturbation or not len(frames) or rank < 1:
+    if side not in model.perturbation or not frames:
         return None
     known = {frame: row for row, frame in enumerate(avatar.record.frames)}
-    # The wall of the wrist, which comes last, is not fitted.
-    found = np.zeros((len(frames), len(hand), WIDTH), dtype=np.float32)
-    count = len(model.rigs[side])
-    for start in range(0, len(frames), _CHUNK):
-        part = slice(start, start + _CHUNK)
-        given = torch.as_tensor(motion[part], dtype=torch.float32, device=model.log_gains.device)
-        rows = torch.tensor([known[frame] for frame in frames[part]], device=given.device)
-        pose, transl = given[:, :48].reshape(-1, 16, 3), given[:, 48:]
-        betas = torch.as_tensor(avatar.betas[side], dtype=torch.float32, device=given.device)
-        refine = avatar.settings.heads
-        clean, _ = model.gaussians(side, pose, betas, transl, refine=refine)
-        biased, _ = model.gaussians(side, pose, betas, transl, refine=refine, rows=rows)
-        found[part, :count] = _differences(clean, biased, len(pose))
-        for row in range(len(pose)):
-            linear, _ = hand.motions(pose[row].double().cpu().numpy(), np.zeros(3))
-            places = found[start + row, :, :3, None]
-            found[start + row, :, :3] = np.linalg.solve(linear, places)[..., 0]
-    return _components(found / _UNITS.astype(np.float32), rank)
-
-
-def _differences(clean: Gaussians, biased: Gaussians, count: int) -> np.ndarray:
-    """(B, N, 8) of B frames; places in the world."""
-
-    def number(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-        return (b - a).expand(count, *torch.broadcast_shapes(a.shape, b.shape)[-2:])
-
-    scales = [each.scales.log().mean(dim=-1, keepdim=True) for each in (clean, biased)]
-    parts = [
-        number(clean.means, biased.means),
-        number(clean.colors, biased.colors),
-        number(clean.opacities[..., None], biased.opacities[..., None]),
-        number(*scales),
-    ]
-    return torch.cat(parts, dim=-1).cpu().numpy()
-
-
-def _components(values: np.ndarray, rank: int) -> FrameBiases:
-    """Principal components, about zero, of (F, N, 8) values in units of `_UNITS`."""
-    components, coefficients = _principal(values, rank)
-    peaks = np.abs(components).max(axis=1, initial=1e-30)
-    whole = np.rint(components / peaks[:, None] * 127.0).astype(np.int8)
-    return FrameBiases(whole, peaks / 127.0 * _UNITS, coefficients)
-
-
-def _principal(values: np.ndarray, rank: int) -> tuple[np.ndarray, np.ndarray]:
-    """Components (K, N, C) of length 1 and coefficients (P, K) of (P, N, C) values."""
-    flat = values.reshape(len(values), -1)
-    # The Gram matrix is small: there are fewer poses than Gaussians.
-    power, vectors = np.linalg.eigh((flat @ flat.T).astype(np.float64))
-    order = np.argsort(power)[::-1][:rank]
-    order = order[power[order] > 1e-9 * max(float(power.max()), 1e-30)]
-    roots = np.sqrt(power[order])
-    components = (flat.T @ (vectors[:, order] / roots)).T
-    return components.reshape(len(order), *values.shape[1:]), vectors[:, order] * roots
+    rows = torch.tensor([known[frame] for frame in frames], device=model.log_gains.device)
+    module = model.biases_of(side)
+    temporal = module.temporal(rows)
+    mixing, shifts = module.layer(temporal.z)
+    content: dict[str, Any] = {
+        "mixing": _real(_wider(mixing.T, 16)),
+        "shifts": _real(_wider(shifts, 16)),
+        "omega": temporal.omega.tolist(),
+        "gains": model.log_gains[rows].exp().tolist(),
+        "codes": [[] for _ in frames],
+        "maps": "",
+    }
+    if module.field is not None:
+        content["codes"] = module.field.codes(temporal.z).tolist()
+        content["maps"] = _real(nn.functional.pad(module.field.maps, (0, 2)))
+    return content

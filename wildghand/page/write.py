@@ -6,7 +6,7 @@ import base64
 import dataclasses
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,13 +22,18 @@ from hwp_bench.capture import Capture
 from hwp_bench.hands import anatomical_limits, load_template, pose_from_joint_angles
 from hwp_bench.methods.contract import Camera, HandPose
 from hwp_bench.report.page import render_template
-from wildghand.avatar import PosedGaussians, WildGHandAvatar, load_avatar
-from wildghand.avatar.avatar import InlinePicture, splat
+from wildghand.avatar import WildGHandAvatar, load_avatar
+from wildghand.avatar.avatar import InlinePicture
 from wildghand.avatar.render import shown_sides
 from wildghand.avatar.studio import REST
-from wildghand.gaussians.quaternions import matrix_to_quat
-from wildghand.page.bake import BakedHand, FrameBiases, PoseBasis, bake_biases, bake_hand
-from wildghand.visibility.count import seen_anchors
+from wildghand.page.bake import (
+    biases_content,
+    hand_content,
+    light_content,
+    network_content,
+    pack,
+)
+from wildghand.visibility.count import facing_of, seen_anchors
 
 if TYPE_CHECKING:
     from markupsafe import Markup
@@ -38,14 +43,12 @@ if TYPE_CHECKING:
 class PageSettings:
     """How much of the avatar a page holds."""
 
-    #: Principal components of places and of colours that depend on the pose.
-    geometry_rank: int = 6
-    color_rank: int = 12
-    #: Principal components of the biases of the frames that are played; 0: pages cannot show them.
-    bias_rank: int = 4
-    #: Poses of the clip, and random ones within the limits of the joints, that are drawn to bake.
+    #: Poses of the clip, and random ones within the limits of the joints, from which is learnt what
+    #: only follows from the pose.
     clip_samples: int = 80
     random_samples: int = 48
+    #: Principal components of what a network says that is too large for a page.
+    rank: int = 16
     #: Most training frames whose motion is played.
     most_frames: int = 240
     #: Edge of the still image for browsers without WebGL2, px.
@@ -54,8 +57,8 @@ class PageSettings:
     seed: int = 0
 
 
-# Each fourth frame at most is kept out of what is baked, this many at most.
-_HELD_OUT = 8
+# Turns of the hand, in degrees, among which the one is sought in which a page opens.
+_TURNS = range(0, 360, 30)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,15 +66,13 @@ class PoseSamples:
     """Poses of an avatar's hands."""
 
     #: (P, 16, 3) rad by side: the pose at the start, poses of the clip, random ones.
-    baked: Mapping[str, np.ndarray]
+    learnt: Mapping[str, np.ndarray]
     #: The hands when the page is opened.
     start: Mapping[str, HandPose]
     #: Frames that are played, and (F, 51) their poses and translations by side.
     frames: list[int]
     motion: Mapping[str, np.ndarray]
-    #: Frames that were not baked, to measure with.
-    held_out: list[int]
-    #: (4, 4) of the camera at the start.
+    #: (4, 4) of the camera.
     viewmat: np.ndarray
     #: (F,) s, for how long each of them is shown.
     shown: np.ndarray
@@ -82,23 +83,18 @@ def sample_poses(
 ) -> PoseSamples:
     """Choose poses."""
     random = np.random.default_rng(settings.seed)
-    if capture is None:
-        # In the studio, where the light is as frames have shown it.
-        start = avatar.studio.posed()
-        clip = {side: start[side].pose[None] for side in avatar.sides}
-        frames, held_out, viewmat, shown = [], [], np.eye(4), np.zeros(0)
-        motion = {side: np.zeros((0, 51)) for side in avatar.sides}
-    else:
+    # In the studio, where the light is as frames have shown it.
+    start = avatar.studio.posed(REST, best_turn(avatar))
+    clip = {side: start[side].pose[None] for side in avatar.sides}
+    motion = {side: np.zeros((0, 51)) for side in avatar.sides}
+    frames, viewmat, lasts = list[int](), np.eye(4), np.zeros(0)
+    if capture is not None:
         _check(avatar, capture)
         fitted = [frame for frame in avatar.record.frames if _shown(avatar, capture, frame)]
         if not fitted:
             raise UsageError("has no fitted frame that shows every hand", where=capture.root)
         frames = [fitted[pick] for pick in evenly(len(fitted), settings.most_frames)]
-        held_out = [fitted[pick] for pick in evenly(len(fitted), _HELD_OUT + 2)[1:-1]]
-        rest = [frame for frame in fitted if frame not in held_out] or fitted
-        drawn = [rest[pick] for pick in evenly(len(rest), settings.clip_samples)]
-        start = avatar.believed(capture.hand_poses(fitted[0]))
-        clip, motion = {}, {}
+        drawn = [fitted[pick] for pick in evenly(len(fitted), settings.clip_samples)]
         for side in avatar.sides:
             poses = {f: avatar.believed(capture.hand_poses(f))[side] for f in fitted}
             clip[side] = np.stack([start[side].pose, *(poses[frame].pose for frame in drawn)])
@@ -106,12 +102,30 @@ def sample_poses(
                 [np.append(poses[frame].pose.ravel(), poses[frame].transl) for frame in frames]
             )
         viewmat, times = capture.camera(fitted[0]).viewmat, capture.info.frame_times()[frames]
-        shown = np.diff(times, append=times[-1] + 1.0 / capture.info.fps)
-    baked = {
+        lasts = np.diff(times, append=times[-1] + 1.0 / capture.info.fps)
+    learnt = {
         side: np.concatenate([poses, _random(avatar, side, poses, settings.random_samples, random)])
         for side, poses in clip.items()
     }
-    return PoseSamples(baked, start, frames, motion, held_out, viewmat, shown)
+    return PoseSamples(learnt, start, frames, motion, viewmat, lasts)
+
+
+@torch.no_grad()
+def best_turn(avatar: WildGHandAvatar) -> int:
+    """The turn, in degrees, in which the resting hand shows most of the skin that frames show."""
+    visibility = avatar.model.visibility
+    if visibility is None:
+        return 0
+
+    def shown(turn: int) -> float:
+        total = 0.0
+        for side, given in avatar.posed(avatar.studio.posed(REST, turn)).items():
+            anchors = avatar.model.rigs[side].pose(*given)
+            facing = facing_of(anchors, torch.eye(4)[None].to(anchors.positions))[0]
+            total += float((facing.clamp(min=0.0) * visibility.offsets[side]).sum())
+        return total
+
+    return max(_TURNS, key=shown)
 
 
 def hand_controls(avatar: WildGHandAvatar, side: str) -> dict[str, Any]:
@@ -155,66 +169,6 @@ def _shown(avatar: WildGHandAvatar, capture: Capture, frame: int) -> bool:
 
 # Field of view of the still image, and how much of it the hand fills.
 _FOCAL, _FILLED = 2.0, 0.8
-
-
-@dataclass(frozen=True)
-class Fidelity:
-    """PSNR over the hand's box against `WildGHandAvatar.render`, dB; of the mean square error."""
-
-    #: As the page draws: joints, and linear parts.
-    baked: float
-    #: Joints alone, with the mean of the rest.
-    joints_only: float
-
-
-def fidelity(
-    avatar: WildGHandAvatar,
-    capture: Capture,
-    hands: Mapping[str, BakedHand],
-    frames: Sequence[int],
-) -> Fidelity | None:
-    """Compare both forms with the avatar in frames of a capture; None without frames."""
-    if not frames:
-        return None
-
-    def mean_only(basis: PoseBasis) -> PoseBasis:
-        return replace(basis, steps=np.zeros_like(basis.steps))
-
-    fixed = {
-        side: replace(hand, means=mean_only(hand.means), colors=mean_only(hand.colors))
-        for side, hand in hands.items()
-    }
-    errors: dict[str, list[float]] = {"baked": [], "joints_only": []}
-    for frame in frames:
-        poses, camera = capture.hand_poses(frame), capture.camera(frame)
-        poses = avatar.believed({side: poses[side] for side in avatar.sides})
-        truth = avatar.render(poses, camera)
-        seen = np.argwhere(truth[..., 3] > 0.5)
-        if not len(seen):
-            continue
-        box = tuple(slice(a, b + 1) for a, b in zip(seen.min(0), seen.max(0), strict=True))
-        for name, form in (("baked", hands), ("joints_only", fixed)):
-            drawn = draw_baked(form, poses, camera)
-            errors[name].append(float(np.square(drawn[box] - truth[..., :3][box]).mean()))
-    if not errors["baked"]:
-        return None
-    means = {name: -10.0 * np.log10(np.mean(each) + 1e-12) for name, each in errors.items()}
-    return Fidelity(**{name: round(float(mean), 2) for name, mean in means.items()})
-
-
-def draw_baked(
-    hands: Mapping[str, BakedHand], poses: Mapping[str, HandPose], camera: Camera
-) -> np.ndarray:
-    """(H, W, 3) sRGB over black of baked hands, by the project's own rasterizer."""
-    parts = [hand.posed(poses[side].pose, poses[side].transl) for side, hand in hands.items()]
-    means, covariances, colors = (np.concatenate(column) for column in zip(*parts, strict=True))
-    power, axes = np.linalg.eigh(covariances)
-    axes[np.linalg.det(axes) < 0.0, :, 0] *= -1.0
-
-    opacities = np.concatenate([hand.opacities for hand in hands.values()])
-    quats = matrix_to_quat(torch.as_tensor(axes, dtype=torch.float32)).numpy()
-    scales = np.sqrt(power.clip(min=0.0))
-    return splat(PosedGaussians(means, quats, scales, opacities, colors), camera)[..., :3]
 
 
 def still_image(avatar: WildGHandAvatar, samples: PoseSamples, size: int) -> bytes:
@@ -264,7 +218,7 @@ def mean_weights(
 
 
 # In the order in which they are run.
-_SCRIPTS = ("hand.js", "splats.js", "controls.js")
+_SCRIPTS = ("hand.js", "gaussians.js", "splats.js", "controls.js")
 
 
 @dataclass(frozen=True)
@@ -277,8 +231,6 @@ class PageFacts:
     gaussians: int
     #: Training frames that are played.
     frames: int
-    #: PSNR against the avatar itself on frames that were not baked; None without a capture.
-    fidelity: Fidelity | None
 
 
 def write_page(
@@ -312,38 +264,29 @@ def write_page(
     if isinstance(avatar, Path):
         avatar = load_avatar(avatar, hand=hand)
     samples = sample_poses(avatar, capture, settings)
+    network = network_content(avatar)
     hands = {
-        side: bake_hand(
-            avatar,
-            side,
-            samples.baked[side],
-            geometry_rank=settings.geometry_rank,
-            color_rank=settings.color_rank,
+        side: hand_content(
+            avatar, side, samples.learnt[side], tabled=network is None, rank=settings.rank
         )
         for side in avatar.sides
     }
-    measured = None if capture is None else fidelity(avatar, capture, hands, samples.held_out)
-    biases = {
-        side: bake_biases(
-            avatar, side, baked, samples.frames, samples.motion[side], settings.bias_rank
-        )
-        for side, baked in hands.items()
-    }
     weights = {} if capture is None else mean_weights(avatar, capture, avatar.weight_masks)
     content = {
+        "network": network,
+        "light": light_content(avatar),
         "hands": [
             {
-                **_hand(baked),
+                **hand,
                 **hand_controls(avatar, side),
-                "seen": _seen(avatar, side, len(baked)),
-                "biases": _biases(biases[side]),
-                "trusted": _trusted(weights.get(side), len(baked)),
-                "side": side,
+                "seen": avatar.model.visibility is not None,
+                "biases": biases_content(avatar, side, samples.frames),
+                "trusted": _trusted(weights.get(side), hand["count"]),
                 "start": samples.start[side].pose.tolist(),
                 "transl": samples.start[side].transl.tolist(),
-                "motion": _pack(samples.motion[side].astype("<f4")),
+                "motion": pack(samples.motion[side].astype("<f4")),
             }
-            for side, baked in hands.items()
+            for side, hand in hands.items()
         ],
         "viewmat": samples.viewmat.tolist(),
         "shown": samples.shown.round(4).tolist(),
@@ -351,13 +294,11 @@ def write_page(
         "omega": _by_frame(avatar, samples.frames),
         "weights": _weights(avatar, samples.frames),
     }
-    record, count = avatar.record, sum(len(baked) for baked in hands.values())
+    record, count = avatar.record, sum(hand["count"] for hand in hands.values())
     steps = f"{record.steps:,} steps"
     if record.chosen_steps is not None:
         steps = f"the state of step {record.chosen_steps:,} of {record.steps:,}"
     facts = [f"{count:,} Gaussians", f"{steps} on {len(record.frames)} frames"]
-    if measured is not None:
-        facts.append(f"{measured.baked:.1f} dB from the avatar's own drawing")
     still = base64.b64encode(still_image(avatar, samples, settings.still_size)).decode()
     html = render_template(
         "wildghand.page",
@@ -375,7 +316,6 @@ def write_page(
         bytes=len(html.encode()),
         gaussians=count,
         frames=len(samples.frames),
-        fidelity=measured,
     )
 
 
@@ -405,71 +345,14 @@ def _text(name: str) -> Markup:
     return Markup(files("wildghand.page").joinpath("templates", name).read_text("utf-8"))
 
 
-def _hand(hand: BakedHand) -> dict[str, Any]:
-    return {
-        "count": len(hand),
-        "joints": hand.joints.tolist(),
-        "influences": _pack(hand.influences),
-        "weights": _pack(np.rint(hand.weights * 65535.0).astype("<u2")),
-        "means": _linear(hand.means),
-        "colors": _linear(hand.colors),
-        "covariances": _pack(hand.covariances.astype("<f4")),
-        "opacities": _pack(hand.opacities.astype("<f4")),
-        "normals": _pack(np.rint(hand.normals * 127.0).astype(np.int8)),
-    }
-
-
-def _seen(avatar: WildGHandAvatar, side: str, count: int) -> str | None:
-    """(N,) uint8: how far the clip has shown each Gaussian; None where the fit did not count.
-
-    255 is the share of the frames at which the fit keeps half of an offset from the skin
-    (`wildghand.visibility`), or more of them.
-    """
-    visibility = avatar.model.visibility
-    if visibility is None:
-        return None
-    kept = visibility.offsets[side].double().cpu().numpy()
-    # Of frames f and their half h a fit keeps k = f / (f + h); f / h is k / (1 - k).
-    share = np.clip(kept / np.maximum(1.0 - kept, 1e-9), 0.0, 1.0)
-    return _pack(_with_wall(np.rint(share * 255.0), count))
-
-
-def _biases(biases: FrameBiases | None) -> dict[str, Any] | None:
-    if biases is None:
-        return None
-    return {
-        "basis": _pack(biases.basis),
-        "steps": biases.steps.tolist(),
-        "coefficients": biases.coefficients.round(5).tolist(),
-    }
-
-
 def _trusted(weights: np.ndarray | None, count: int) -> str | None:
     """(N,) uint8 mean weights, 254 = full; 255 where no frame shows the place."""
     if weights is None:
         return None
     shares = np.rint(np.nan_to_num(weights).clip(0.0, 1.0) * 254.0)
-    return _pack(_with_wall(np.where(np.isnan(weights), 255, shares), count))
-
-
-def _with_wall(values: np.ndarray, count: int) -> np.ndarray:
-    """(count,) uint8 of a hand and the wall of its wrist, which is as drawn: no frame is asked."""
-    wall = np.full(count - len(values), 255)
-    return np.concatenate([values, wall]).astype(np.uint8)
-
-
-def _linear(basis: PoseBasis) -> dict[str, Any]:
-    return {
-        "mean": _pack(basis.mean.astype("<f4")),
-        "basis": _pack(basis.basis),
-        "steps": basis.steps.tolist(),
-        "regression": _pack(basis.regression.astype("<f4")),
-        "bounds": basis.bounds.tolist(),
-    }
-
-
-def _pack(array: np.ndarray) -> str:
-    return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode()
+    found = np.full(count, 255, np.uint8)
+    found[: len(weights)] = np.where(np.isnan(weights), 255, shares)
+    return pack(found)
 
 
 def _by_frame(avatar: WildGHandAvatar, frames: Sequence[int]) -> list[float]:

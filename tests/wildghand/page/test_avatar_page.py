@@ -1,7 +1,7 @@
 """The page of an avatar. Oracles: `WildGHandAvatar.render` in the same pose and camera, the model
 with its biases, cv2.projectPoints.
 
-Tolerance: 30 dB over the hand's box, which is the mean error of 8 grey levels.
+Tolerance: 37 dB over the hand's box, which is the mean error of 3.6 grey levels.
 """
 
 from __future__ import annotations
@@ -24,20 +24,24 @@ import wildghand
 from hwp_bench.base.errors import HwpError, UsageError
 from hwp_bench.capture import Capture
 from hwp_bench.hands import anatomical_limits, load_template, pose_from_joint_angles
+from hwp_bench.hands.articulation import axis_angle_to_matrix
 from hwp_bench.methods.contract import HandPose
 from wildghand.avatar import WildGHandAvatar, load_avatar, save_avatar
 from wildghand.cli.main import main
 from wildghand.fitting.components import make_fit
 from wildghand.fitting.fit import StepBatch
 from wildghand.model.settings import read_settings
-from wildghand.page import bake_hand, write_page
-from wildghand.page.bake import bake_biases, joint_motions
-from wildghand.page.write import PageSettings, draw_baked, mean_weights, sample_poses
+from wildghand.page import write_page
+from wildghand.page.bake import pack_correctives
+from wildghand.page.write import PageSettings, best_turn, mean_weights, sample_poses
 from wildghand.splat import rasterize
+from wildghand.visibility import ColorChanges
 
 QUICK: dict[str, Any] = {**TINY, "gaussians": 600}
-SMALL = PageSettings(clip_samples=16, random_samples=12, still_size=48)
-LEAST = 30.0
+SMALL = PageSettings(still_size=48)
+# Nothing turns by itself.
+STILL = ("--force-prefers-reduced-motion",)
+LEAST = 37.0
 
 
 def psnr(found: np.ndarray, truth: np.ndarray, coverage: np.ndarray) -> float:
@@ -73,7 +77,7 @@ def page(fitted, folder: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def opened(page: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    with open_page(page, tmp_path_factory.mktemp("profile"), webgl=True) as driver:
+    with open_page(page, tmp_path_factory.mktemp("profile"), webgl=True, flags=STILL) as driver:
         driver.execute_script("avatar.setBackground('#000000')")
         yield driver
 
@@ -127,6 +131,7 @@ def test_the_page_draws_a_frame_with_its_biases(opened, fitted) -> None:
             opened.execute_script("avatar.setShown(arguments[0])", kind)
             pictures[kind] = drawn(opened, capture, frames[row])
         truth = biased(avatar, capture, frames[row])
+        # The oracle has no wall in the wrist.
         assert psnr(pictures["biases"], truth[..., :3], truth[..., 3]) > 30.0
         assert psnr(pictures["clean"], truth[..., :3], truth[..., 3]) < 28.0
     opened.execute_script("avatar.setShown('clean')")
@@ -201,6 +206,63 @@ return sum;
 """
 
 
+SHARE = """
+const done = arguments[arguments.length - 1], sent = [];
+navigator.canShare = () => arguments[0];
+navigator.share = async ({ files }) => { sent.push(files[0]); };
+HTMLAnchorElement.prototype.click = function () { sent.push(this); };
+document.getElementById("share").click();
+(async () => {
+  while (!sent.length) await new Promise((next) => setTimeout(next, 20));
+  const blob = sent[0] instanceof File ? sent[0] : await (await fetch(sent[0].href)).blob();
+  const image = await createImageBitmap(blob);
+  done([sent[0].name || sent[0].download, image.width, image.height]);
+})();
+"""
+
+
+def test_a_picture_is_sent_where_the_browser_can_and_else_a_file(opened) -> None:
+    size = opened.execute_script(
+        "const c = avatar.pixels() && document.querySelector('canvas');return [c.width, c.height]"
+    )
+    assert opened.execute_async_script(SHARE, True) == ["hand.png", *size]
+
+
+def test_pose_correctives_are_those_of_the_hand_model(opened) -> None:
+    random = np.random.default_rng(0)
+    # As many components as are kept, so that nothing but the rounding to 8 bits is lost.
+    left, right = random.normal(size=(60, 9)), random.normal(size=(9, 135))
+    basis = torch.as_tensor(1e-3 * (left @ right).reshape(20, 3, 135))
+    turns = axis_angle_to_matrix(torch.as_tensor(random.normal(0, 0.5, (16, 3))))
+    feature = (turns[1:] - torch.eye(3)).reshape(-1)
+    made = opened.execute_script(
+        "const { basis, map } = arguments[0], hand = Object.create(Hand.prototype);"
+        "hand.rest = new Float32Array(60);"
+        "hand.correctives = { basis: unpack(basis, Int8Array), map: unpack(map, Float32Array) };"
+        "return Array.from(hand.shaped(arguments[1]));",
+        pack_correctives(basis),
+        turns.reshape(16, 9).tolist(),
+    )
+    truth = (basis.double() @ feature).numpy().reshape(-1)
+    np.testing.assert_allclose(made, truth, atol=0.02 * np.abs(truth).max())
+
+
+def test_a_page_opens_on_the_side_that_frames_show(fitted) -> None:
+    avatar, _ = fitted
+    turn = best_turn(avatar)
+    camera = avatar.studio.camera(32, 32)
+    marked = copy.deepcopy(avatar)
+    # Skin that frames show is white, other skin black.
+    kept = marked.model.visibility.offsets["right"][:, None]
+    logits = torch.where(kept > kept.median(), 9.0, -9.0).expand(-1, 3)
+    marked.model.keep(ColorChanges({"right": logits}))
+    shown = [
+        marked.render(marked.studio.posed("rest", angle), camera)[..., :3].mean()
+        for angle in (turn, turn + 180)
+    ]
+    assert shown[0] > shown[1]
+
+
 def test_skin_that_no_frame_shows_is_marked(opened) -> None:
     opened.execute_script("avatar.setFrame(0)")
     show(opened, 400)
@@ -220,6 +282,20 @@ def test_the_page_asks_for_no_other_file(opened) -> None:
         "return performance.getEntriesByType('resource').map(e => e.name)"
     )
     assert [name for name in asked if not name.startswith("data:")] == []
+
+
+def test_a_network_that_is_too_large_is_drawn_by_components(
+    fitted, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    avatar, capture = fitted
+    monkeypatch.setattr("wildghand.page.write.network_content", lambda avatar: None)
+    write_page(avatar, tmp_path / "avatar.html", capture=capture, settings=SMALL)
+    frame = avatar.record.frames[5]
+    with open_page(tmp_path / "avatar.html", tmp_path, webgl=True, flags=STILL) as driver:
+        driver.execute_script("avatar.setBackground('#000000'); avatar.setFrame(5)")
+        found = drawn(driver, capture, frame)
+    truth = avatar.render({"right": capture.hand_poses(frame)["right"]}, capture.camera(frame))
+    assert psnr(found, truth[..., :3], truth[..., 3]) > 30.0
 
 
 def test_without_webgl_a_picture_is_shown(page: Path, tmp_path: Path) -> None:
@@ -259,33 +335,6 @@ def test_gaussians_of_a_frame_are_those_that_the_fit_draws(make_training: Any) -
     assert float(drawn.image.max()) > 0.1
 
 
-def test_baked_biases_are_the_models(fitted) -> None:
-    avatar, capture = fitted
-    frames = avatar.record.frames[:9]
-    hands = [capture.hand_poses(frame)["right"] for frame in frames]
-    motion = np.stack([np.append(hand.pose.ravel(), hand.transl) for hand in hands])
-    hand = bake_hand(avatar, "right", hands[0].pose[None], geometry_rank=2, color_rank=2)
-    # As many components as frames: what is left is the rounding to 8 bits.
-    found = bake_biases(avatar, "right", hand, frames, motion, rank=9)
-    assert found is not None
-    clean = avatar.pose({"right": hands[4]})
-    given = avatar.posed({"right": hands[4]})["right"]
-    with torch.no_grad():
-        truth, _ = avatar.model.gaussians("right", *given, rows=torch.tensor([4]))
-    skin = len(avatar.model.rigs["right"])
-    added, wall = np.split(found.at(4), [skin])
-    assert len(wall) == len(avatar.model.wall("right"))
-    assert not wall.any()
-    np.testing.assert_allclose(added[:, 3:6], truth.colors[0].numpy() - clean.colors, atol=0.01)
-    np.testing.assert_allclose(
-        added[:, 6], truth.opacities.reshape(-1).numpy() - clean.opacities, atol=0.01
-    )
-    assert np.abs(added[:, 3:6]).max() > 0.05
-    off = copy.deepcopy(avatar)
-    off.model.perturbation.clear()
-    assert bake_biases(off, "right", hand, frames, motion, rank=9) is None
-
-
 def test_weights_are_those_of_the_places_in_the_masks(fitted, folder: Path) -> None:
     avatar, capture = fitted
     frame = avatar.record.frames[0]
@@ -311,35 +360,6 @@ def test_weights_are_those_of_the_places_in_the_masks(fitted, folder: Path) -> N
     np.testing.assert_array_equal(kept[frame], known[frame])
 
 
-def test_joints_move_as_the_hand_models() -> None:
-    template = load_template("anny", "left").to_torch(torch.float64)
-    random = np.random.default_rng(3)
-    pose, transl = random.normal(0, 0.5, (16, 3)), random.normal(0, 1, 3)
-    from hwp_bench.hands import pose_hand
-
-    truth = pose_hand(
-        template,
-        torch.as_tensor(pose)[None],
-        torch.zeros(10, dtype=torch.float64),
-        torch.as_tensor(transl)[None],
-    ).transforms[0]
-    turns, shifts = joint_motions(template.joints.numpy(), pose, transl)
-    np.testing.assert_allclose(turns, truth[:, :3, :3], atol=1e-12)
-    np.testing.assert_allclose(shifts, truth[:, :3, 3], atol=1e-12)
-
-
-def test_what_was_baked_from_one_pose_is_that_pose(fitted) -> None:
-    avatar, capture = fitted
-    frame = avatar.record.frames[5]
-    hand = capture.hand_poses(frame)["right"]
-    baked = bake_hand(avatar, "right", hand.pose[None], geometry_rank=6, color_rank=12)
-    means, _, colors = baked.posed(hand.pose, hand.transl)
-    # Without a camera, since the light beyond known normals depends on it and is not baked.
-    truth = avatar.pose({"right": hand}, closed=True)
-    np.testing.assert_allclose(means, truth.means, atol=1e-5)
-    np.testing.assert_allclose(colors, truth.colors, atol=1e-5)
-
-
 def test_frames_are_played_at_the_pace_at_which_they_were_recorded(fitted) -> None:
     """Oracle: the times of the capture, also where frames are left out."""
     avatar, capture = fitted
@@ -357,40 +377,6 @@ def test_frames_are_played_at_the_pace_at_which_they_were_recorded(fitted) -> No
         assert len(samples.shown) == len(samples.frames) <= most
         np.testing.assert_allclose(samples.shown[:-1], np.diff(times[samples.frames]))
         assert samples.shown[-1] == pytest.approx(1 / 30)
-
-
-def test_without_a_capture_a_page_opens_as_the_studio_shows_the_hand(fitted) -> None:
-    avatar, _ = fitted
-    samples = sample_poses(avatar, None, SMALL)
-    baked = bake_hand(avatar, "right", samples.baked["right"], geometry_rank=6, color_rank=12)
-    camera = avatar.studio.camera(64, 64)
-    truth = avatar.render(avatar.studio.posed(), camera)
-    found = draw_baked({"right": baked}, samples.start, camera)
-    assert psnr(found, truth[..., :3], truth[..., 3]) >= LEAST
-    np.testing.assert_array_equal(samples.viewmat, camera.viewmat)
-
-
-def test_the_wall_of_the_wrist_follows_the_hand(fitted) -> None:
-    avatar, capture = fitted
-    hands = [capture.hand_poses(frame)["right"] for frame in avatar.record.frames[::4]]
-    baked = bake_hand(
-        avatar, "right", np.stack([hand.pose for hand in hands]), geometry_rank=6, color_rank=12
-    )
-    skin, wall = len(avatar.model.rigs["right"]), len(avatar.model.wall("right"))
-    assert len(baked) == skin + wall
-    for hand in hands:
-        means, covariances, _ = baked.posed(hand.pose, hand.transl)
-        truth = avatar.pose({"right": hand}, closed=True)
-        np.testing.assert_allclose(means[skin:], truth.means[skin:], atol=2e-4)
-        # Discs lie in the plane that their centres span, and are as thin.
-        outwards = np.linalg.svd(means[skin:] - means[skin:].mean(axis=0))[2][2]
-        thickness = np.sqrt(outwards @ covariances[skin:] @ outwards)
-        np.testing.assert_allclose(thickness, truth.scales[skin:].min(axis=1), rtol=0.5)
-        turns, _ = baked.motions(hand.pose, hand.transl)
-        normals = np.einsum("nij,nj->ni", turns, baked.normals)[skin:]
-        assert (np.abs(normals @ outwards) > 0.95).all()
-        # They point away from the hand.
-        assert ((means[:skin].mean(axis=0) - means[skin:]) * normals).sum(axis=1).max() < 0.0
 
 
 def test_the_command_says_what_it_wrote(fitted, folder: Path, tmp_path: Path, capsys) -> None:

@@ -18,65 +18,79 @@ const content = JSON.parse(one("content").textContent);
 function start() {
   const hands = content.hands.map((data) => new Hand(data));
   const canvas = one("view");
-  const splats = new Splats(canvas, hands.reduce((sum, hand) => sum + hand.count, 0));
-  const base = content.viewmat.slice(0, 3).flatMap((row) => row.slice(0, 3));
+  const splats = new Splats(canvas, content, hands);
+  const base = Float64Array.from(content.viewmat.slice(0, 3).flatMap((row) => row.slice(0, 3)));
   const eye = { yaw: 0, pitch: 0, distance: 1, centre: [0, 0, 0] };
-  const state = { camera: null, stale: true, dirty: true, playing: false, frame: 0, sliders: [] };
+  const state = { camera: null, dirty: true, playing: false, turning: 0, soft: true, frame: 0, sliders: [] };
   let radius = 0.1;
 
-  function update() {
-    const light = one("relight").checked && lightOf(), marks = one("unseen").checked;
-    let first = 0;
-    const shown = one("shown").value;
-    for (const hand of hands) {
-      hand.write(splats.data, first, light, marks, shown);
-      first += hand.count;
-    }
-    splats.upload();
-    const places = hands.flatMap((hand) => hand.chain().places);
-    eye.centre = [0, 1, 2].map((i) => {
+  // The hand turns and not the camera, so that its light is the one that frames have shown.
+  function turned() {
+    if (state.camera || (!eye.yaw && !eye.pitch)) return null;
+    const inner = product(rotation([eye.pitch, 0, 0]), rotation([0, eye.yaw, 0]));
+    return product(product(transposed(base), inner), base);
+  }
+  function centre() {
+    const places = hands.flatMap((hand) => hand.chain(hand.turned(null)).places);
+    return [0, 1, 2].map((i) => {
       const all = places.map((p) => p[i]);
       return (Math.min(...all) + Math.max(...all)) / 2;
     });
-    state.stale = false;
   }
   function lightOf() {
+    if (!one("relight").checked) return [0, 0, 0, 0];
     const angle = (one("angle").value * Math.PI) / 180, high = (one("height").value * Math.PI) / 180;
     const seen = [Math.sin(angle) * Math.cos(high), -Math.sin(high), -Math.cos(angle) * Math.cos(high)];
-    const [x, y, z] = apply(transposed(Float64Array.from(base)), seen);
-    return { x, y, z, strength: one("strength").value / 100 };
+    return [...apply(transposed(base), seen), one("strength").value / 100];
   }
   function view() {
     if (state.camera) return state.camera;
     const ratio = Math.min(window.devicePixelRatio || 1, 2);
     const width = Math.max(1, Math.round(canvas.clientWidth * ratio));
     const height = Math.max(1, Math.round(canvas.clientHeight * ratio));
-    const yaw = rotation([0, eye.yaw, 0]), pitch = rotation([eye.pitch, 0, 0]);
-    const turn = Array.from(product(product(pitch, yaw), base));
-    const moved = apply(turn, eye.centre), focal = 2 * Math.min(width, height);
+    const moved = apply(base, eye.centre), focal = 2 * Math.min(width, height);
     const shift = [-moved[0], -moved[1], eye.distance - moved[2]];
-    return { turn, shift, lens: [focal, focal, width / 2, height / 2], width, height };
+    return { turn: Array.from(base), shift, lens: [focal, focal, width / 2, height / 2], width, height };
   }
   function background() {
     const text = one("background").value;
     return [1, 3, 5].map((i) => parseInt(text.slice(i, i + 2), 16) / 255);
   }
-  function draw() {
-    if (state.stale) update();
-    splats.draw(view(), background());
-    state.dirty = false;
+  function pose() {
+    eye.centre = centre();
+    const at = view(), back = transposed(Float64Array.from(at.turn));
+    splats.gaussians.pose(turned(), eye.centre, {
+      eye: apply(back, at.shift).map((v) => -v),
+      extra: lightOf(), shown: one("shown").value, marked: one("unseen").checked,
+    });
+    return at;
   }
-  function changed(stale = true) {
-    state.stale = state.stale || stale;
+  function draw() {
+    state.dirty = false;
+    splats.draw(pose(), background(), state.soft ? 0.14 : 0);
+  }
+  function changed() {
     if (!state.dirty) { state.dirty = true; requestAnimationFrame(draw); }
   }
   function fit() {
-    update();
-    const data = splats.data;
+    Object.assign(eye, { yaw: 0, pitch: 0 });
+    pose();
+    const { data } = splats.gaussians;
     radius = 0;
-    for (let o = 0; o < 16 * splats.count; o += 16)
+    for (let o = 0; o < data.length; o += 16)
       radius = Math.max(radius, Math.hypot(...eye.centre.map((c, i) => c - data[o + i])));
-    Object.assign(eye, { yaw: 0, pitch: 0, distance: (radius * 4) / 0.85 });
+    eye.distance = (radius * 4) / 0.85;
+  }
+  // Slowly around, once in 24 seconds, until something is touched or the browser is too slow for it.
+  let late = 0;
+  function rest() { state.turning = 0; }
+  function spin(now, before) {
+    late = now - before > 200 ? late + 1 : 0;
+    if (late > 3) rest();
+    if (!state.turning) return;
+    eye.yaw += (Math.min(now - before, 100) / 24000) * 2 * Math.PI;
+    draw();
+    state.turning = requestAnimationFrame((next) => spin(next, now));
   }
 
   // Sliders: a group for each finger, and one for the wrist, of each hand.
@@ -116,7 +130,7 @@ function start() {
   }
   function showAngles() {
     for (const { hand, joint, part, input, shown } of state.sliders) {
-      const angle = joint ? hand.angles(joint)[part] : (hand.vector[part] * 180) / Math.PI;
+      const angle = joint ? hand.angles(joint)[part] : (hand.vectors[0][part] * 180) / Math.PI;
       input.value = angle;
       shown.textContent = `${angle.toFixed(0)}°`;
     }
@@ -190,12 +204,12 @@ function start() {
     state.camera = null;
     eye.yaw += dx;
     eye.pitch = Math.min(Math.max(eye.pitch - dy, -1.55), 1.55);
-    changed(false);
+    changed();
   }
   function zoom(factor) {
     state.camera = null;
     eye.distance = Math.min(Math.max(eye.distance * factor, radius * 1.5), radius * 30);
-    changed(false);
+    changed();
   }
   const spread = () => {
     const [a, b] = [...pointers.values()];
@@ -236,7 +250,7 @@ function start() {
       if (name !== "relight") one("relight").checked = true;
       changed();
     });
-  const can = { biases: hands.some((h) => h.biases), weights: hands.some((h) => h.trusted) };
+  const can = { biases: hands.some((h) => h.data.biases), weights: hands.some((h) => h.data.trusted) };
   for (const [kind, there] of Object.entries(can)) {
     const option = one("shown").querySelector(`[value=${kind}]`);
     option.hidden = option.disabled = !there;
@@ -249,32 +263,60 @@ function start() {
     changed();
   }
   one("shown").addEventListener("input", () => setShown(one("shown").value));
-  one("visibility").hidden = !hands.some((hand) => hand.seen);
+  one("visibility").hidden = !hands.some((hand) => hand.data.seen);
   one("unseen").addEventListener("input", () => changed());
-  one("background").addEventListener("input", () => changed(false));
-  new ResizeObserver(() => changed(false)).observe(canvas);
+  function setBackground(color) {
+    one("background").value = color;
+    state.soft = false;
+    changed();
+  }
+  one("background").addEventListener("input", () => setBackground(one("background").value));
+  new ResizeObserver(() => changed()).observe(canvas);
   canvas.addEventListener("webglcontextlost", () => fallback("The browser took WebGL2 away."));
 
-  if (matchMedia("(prefers-color-scheme: dark)").matches) one("background").value = "#14181b";
+  if (matchMedia("(prefers-color-scheme: dark)").matches) one("background").value = "#2a3036";
+  // A picture of what is seen, to send where the browser can, else as a file.
+  one("share").addEventListener("click", () => {
+    draw();
+    canvas.toBlob(async (blob) => {
+      const file = new File([blob], "hand.png", { type: "image/png" });
+      if (navigator.canShare && navigator.canShare({ files: [file] })) {
+        await navigator.share({ files: [file], title: document.title }).catch(() => {});
+        return;
+      }
+      const link = document.createElement("a");
+      Object.assign(link, { href: URL.createObjectURL(blob), download: "hand.png" });
+      link.click();
+      setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+    }, "image/png");
+  });
   state.dirty = false;
   fit();
-  if (frames) setFrame(0);
   showAngles();
   changed();
-  window.avatar = {
+  for (const kind of ["pointerdown", "keydown", "wheel", "input"])
+    document.addEventListener(kind, rest, { capture: true, passive: true });
+  if (!matchMedia("(prefers-reduced-motion: reduce)").matches)
+    state.turning = requestAnimationFrame((now) => spin(now, now));
+  const actions = {
     // {side: [pose (16, 3) rad, transl (3) m]}.
-    setPose, setFrame, setNamed, setShown,
-    setBackground: (color) => { one("background").value = color; changed(false); },
+    setPose, setFrame, setNamed, setShown, setBackground,
     // viewmat (4, 4), K (3, 3), px; the canvas gets this size until the view is turned.
     setCamera(viewmat, K, width, height) {
       const turn = viewmat.slice(0, 3).flatMap((row) => row.slice(0, 3));
       const shift = viewmat.slice(0, 3).map((row) => row[3]);
       state.camera = { turn, shift, lens: [K[0][0], K[1][1], K[0][2], K[1][2]], width, height };
-      changed(false);
+      changed();
     },
-    orbit: (yaw, pitch) => { Object.assign(eye, { yaw, pitch }); state.camera = null; changed(false); },
+    orbit(yaw, pitch) {
+      Object.assign(eye, { yaw, pitch });
+      state.camera = null;
+      changed();
+    },
     pixels() { draw(); return splats.pixels(); },
   };
+  window.avatar = Object.fromEntries(Object.entries(actions).map(([name, act]) =>
+    [name, (...given) => { rest(); return act(...given); }]));
 }
 function fallback(reason) {
   document.body.classList.add("still");

@@ -1,10 +1,5 @@
-// A hand of the avatar: from angles of joints to Gaussians in the world.
+// A hand of the avatar: from angles of joints to its surface in the world.
 "use strict";
-// Colour of skin that no frame has shown; no skin has it.
-const UNSEEN = [0.55, 0.2, 0.85];
-// Colours of a weight from 0 to 1, and of a place without one.
-const RAMP = [[0.27, 0.0, 0.33], [0.23, 0.32, 0.55], [0.13, 0.57, 0.55], [0.37, 0.79, 0.38], [0.99, 0.91, 0.14]];
-const UNWEIGHED = [0.6, 0.6, 0.6];
 const PARENTS = [-1, 0, 1, 2, 0, 4, 5, 0, 7, 8, 0, 10, 11, 0, 13, 14];
 
 function unpack(text, Type) {
@@ -37,81 +32,74 @@ function rotation(vector) {
     x * z * k - y * s, y * z * k + x * s, c + z * z * k);
 }
 
-// N vectors that are linear in the rotations of the joints: mean, and K components.
-class LinearPart {
-  constructor(data) {
-    this.mean = unpack(data.mean, Float32Array);
-    this.basis = unpack(data.basis, Int8Array);
-    this.regression = unpack(data.regression, Float32Array);
-    this.steps = data.steps;
-    this.bounds = data.bounds;
-    this.values = this.mean.slice();
-  }
-  update(turns) {
-    const rank = this.steps.length, size = this.mean.length;
-    this.values.set(this.mean);
-    for (let k = 0; k < rank; k++) {
-      let sum = this.regression[144 * rank + k];
-      for (let f = 0; f < 144; f++) sum += turns[(f / 9) | 0][f % 9] * this.regression[f * rank + k];
-      const c = this.steps[k] * Math.min(Math.max(sum, this.bounds[0][k]), this.bounds[1][k]);
-      for (let i = 0, b = k * size; i < size; i++, b++) this.values[i] += c * this.basis[b];
-    }
-  }
+// The vector of a rotation, at most pi long.
+function logarithm(m) {
+  const cosine = (m[0] + m[4] + m[8] - 1) / 2, angle = Math.acos(Math.min(Math.max(cosine, -1), 1));
+  const axis = [m[7] - m[5], m[2] - m[6], m[3] - m[1]], length = Math.hypot(...axis);
+  if (angle < 1e-6) return axis.map((v) => v / 2);
+  if (length > 1e-4) return axis.map((v) => (v / length) * angle);
+  // Half a turn: the axis is the longest column of m + 1.
+  const columns = [0, 1, 2].map((c) => [m[c], m[3 + c], m[6 + c]].map((v, i) => v + (i === c)));
+  const best = columns.reduce((x, y) => (Math.hypot(...y) > Math.hypot(...x) ? y : x));
+  return best.map((v) => (v / Math.hypot(...best)) * angle);
+}
+// (N, C) numbers in 16 bits each.
+function whole({ low, step, whole }) {
+  return Float32Array.from(unpack(whole, Uint16Array), (v, i) => low[i % low.length] + step[i % low.length] * v);
+}
+// Sums of (145, K) weights of the rotations of the joints, row by row, and of a one.
+function regress(weights, count, turns) {
+  const sums = Array.from(weights.subarray(144 * count));
+  for (let f = 0; f < 144; f++)
+    for (let k = 0; k < count; k++) sums[k] += turns[(f / 9) | 0][f % 9] * weights[f * count + k];
+  return sums;
 }
 
-// What the fit explained as the perturbation of each frame: sum over k of c_fk basis_k, 8 numbers a Gaussian.
-class FrameBiases {
-  constructor(data, count) {
+// What a network that is too large for the page says: a mean and K components, 15 numbers a Gaussian.
+class Table {
+  constructor(data) {
+    Object.assign(this, { steps: data.steps, bounds: data.bounds, mean: unpack(data.mean, Float32Array) });
     this.basis = unpack(data.basis, Int8Array);
-    this.steps = data.steps;
-    this.coefficients = data.coefficients;
-    this.values = new Float32Array(8 * count);
-    this.frame = -1;
+    this.regression = unpack(data.regression, Float32Array);
   }
-  update(frame) {
-    if (frame === this.frame) return;
-    const size = this.values.length;
-    this.values.fill(0);
-    this.steps.forEach((steps, k) => {
-      const c = steps.map((step) => step * this.coefficients[frame][k]);
-      for (let i = 0, b = k * size; i < size; i++, b++) this.values[i] += c[i & 7] * this.basis[b];
+  at(turns) {
+    const values = this.mean.slice(), found = regress(this.regression, this.steps.length, turns);
+    found.forEach((value, k) => {
+      const c = Math.min(Math.max(value, this.bounds[0][k]), this.bounds[1][k]), b = k * values.length;
+      const scaled = this.steps[k].map((step) => step * c);
+      for (let i = 0; i < values.length; i++) values[i] += scaled[i % 15] * this.basis[b + i];
     });
-    this.frame = frame;
+    return values;
   }
-}
-function ramp(share) {
-  const place = Math.min(Math.max(share, 0), 1) * (RAMP.length - 1), low = Math.min(place | 0, RAMP.length - 2);
-  return RAMP[low].map((v, i) => v + (place - low) * (RAMP[low + 1][i] - v));
 }
 
 class Hand {
   constructor(data) {
-    Object.assign(this, { side: data.side, count: data.count, joints: data.joints });
-    this.lower = data.lower;
-    this.upper = data.upper;
+    Object.assign(this, { side: data.side, count: data.count, skin: data.skin, joints: data.joints });
+    Object.assign(this, { lower: data.lower, upper: data.upper, border: data.border, data });
     // Columns of the axes' matrices: flexion, abduction, twist.
     this.axes = data.axes.map((m) => [0, 1, 2].map((c) => m.map((row) => row[c])));
-    this.influences = unpack(data.influences, Uint8Array);
-    this.weights = unpack(data.weights, Uint16Array);
-    this.means = new LinearPart(data.means);
-    this.colors = new LinearPart(data.colors);
-    this.covariances = unpack(data.covariances, Float32Array);
-    this.opacities = unpack(data.opacities, Float32Array);
-    this.restNormals = unpack(data.normals, Int8Array);
-    this.seen = data.seen && unpack(data.seen, Uint8Array);
-    this.biases = data.biases && new FrameBiases(data.biases, data.count);
-    this.trusted = data.trusted && unpack(data.trusted, Uint8Array);
+    this.rest = unpack(data.rest, Float32Array);
+    this.bones = unpack(data.bones, Uint8Array);
+    this.weights = unpack(data.weights, Float32Array);
+    this.faces = unpack(data.faces, Uint32Array);
+    this.steps = data.steps && unpack(data.steps, Float32Array);
+    this.table = data.table && new Table(data.table);
     this.motion = unpack(data.motion, Float32Array);
+    if (data.correctives) {
+      const { basis, map } = data.correctives;
+      this.correctives = { basis: unpack(basis, Int8Array), map: unpack(map, Float32Array) };
+    }
+    // The open wrist's middle and border, once more, carry the discs that close it.
+    this.vertices = this.rest.length / 3 + (this.border.length && this.border.length + 1);
     this.frame = 0;
-    this.start = { pose: data.start, transl: data.transl };
-    this.normals = new Float32Array(3 * this.count);
-    this.setPose(this.start.pose, this.start.transl);
+    this.setPose(data.start, data.transl);
   }
   // Axis-angle vectors (16, 3) rad and a translation in m, as everywhere in the project.
   setPose(pose, transl) {
+    this.vectors = pose.map((v) => [...v]);
     this.turns = pose.map(rotation);
     this.transl = [...transl];
-    this.vector = [...pose[0]];
   }
   setFrame(frame) {
     this.frame = frame;
@@ -124,6 +112,7 @@ class Hand {
     const [a, b, c] = degrees.map((d, i) =>
       rotation(this.axes[joint - 1][i].map((v) => (v * d * Math.PI) / 180)));
     this.turns[joint] = product(product(a, b), c);
+    this.vectors[joint] = logarithm(this.turns[joint]);
   }
   angles(joint) {
     const columns = transposed(Float64Array.from(this.axes[joint - 1].flat()));
@@ -133,85 +122,102 @@ class Hand {
     ].map((a) => (a * 180) / Math.PI);
   }
   setWrist(degrees) {
-    this.vector = degrees.map((d) => (d * Math.PI) / 180);
-    this.turns[0] = rotation(this.vector);
+    this.vectors[0] = degrees.map((d) => (d * Math.PI) / 180);
+    this.turns[0] = rotation(this.vectors[0]);
   }
-  // Places of the joints and their motions: rest place -> turn * place + shift.
-  chain() {
+  // The pose as the network sees it, with the whole hand turned about a place; and its translation.
+  turned(turn, centre) {
+    if (!turn) return { vectors: this.vectors, turns: this.turns, transl: this.transl };
+    const first = product(turn, this.turns[0]), [wrist] = this.joints;
+    const moved = apply(turn, wrist.map((v, i) => v + this.transl[i] - centre[i]));
+    return {
+      vectors: [logarithm(first), ...this.vectors.slice(1)],
+      turns: [first, ...this.turns.slice(1)],
+      transl: moved.map((v, i) => v + centre[i] - wrist[i]),
+    };
+  }
+  // Places of the joints and their motions, rest place -> turn * place + shift, as the network
+  // corrects the pose.
+  chain({ vectors, turns: given, transl }) {
+    let local = given;
+    if (this.steps) {
+      const step = regress(this.steps, 51, given);
+      local = vectors.map((v, j) => rotation(v.map((x, i) => x + step[3 * j + i])));
+      transl = transl.map((v, i) => v + step[48 + i]);
+    }
     const turns = [], places = [], shifts = [];
     for (let j = 0; j < 16; j++) {
       const p = PARENTS[j], rest = this.joints[j];
-      if (p < 0) { turns.push(this.turns[0]); places.push(rest); } else {
+      if (p < 0) { turns.push(local[0]); places.push(rest); } else {
         const step = apply(turns[p], rest.map((v, i) => v - this.joints[p][i]));
         places.push(places[p].map((v, i) => v + step[i]));
-        turns.push(product(turns[p], this.turns[j]));
+        turns.push(product(turns[p], local[j]));
       }
       const moved = apply(turns[j], rest);
-      shifts.push(places[j].map((v, i) => v + this.transl[i] - moved[i]));
+      shifts.push(places[j].map((v, i) => v + transl[i] - moved[i]));
     }
-    return { turns, shifts, places: places.map((p) => p.map((v, i) => v + this.transl[i])) };
+    return { local, turns, shifts, places: places.map((p) => p.map((v, i) => v + transl[i])) };
   }
-  // Write 16 floats a Gaussian: mean, opacity, covariance (6), 2 unused, colour, 1 unused.
-  // shown: `clean`, `biases` of the frame or `weights` of the fit.
-  write(out, first, light, marks, shown) {
-    const { turns, shifts } = this.chain();
-    this.means.update(this.turns);
-    this.colors.update(this.turns);
-    const add = shown === "biases" && this.biases && this.biases.values;
-    if (add) this.biases.update(this.frame);
-    const A = new Float64Array(9), B = new Float64Array(9);
-    const m = this.means.values, c = this.covariances, rgb = this.colors.values;
-    for (let n = 0, o = 16 * first; n < this.count; n++, o += 16) {
-      A.fill(0);
-      let tx = 0, ty = 0, tz = 0, total = 0;
+  // Rest places of the vertices, with what the hand model's correctives add.
+  shaped(local) {
+    if (!this.correctives) return this.rest;
+    const { basis, map } = this.correctives, rest = this.rest.slice(), count = map.length / 135;
+    for (let k = 0; k < count; k++) {
+      let sum = 0;
+      for (let f = 0; f < 135; f++)
+        sum += map[135 * k + f] * (local[1 + ((f / 9) | 0)][f % 9] - (f % 9 % 4 ? 0 : 1));
+      for (let i = 0, b = k * rest.length; i < rest.length; i++, b++) rest[i] += sum * basis[b];
+    }
+    return rest;
+  }
+  // Write 8 floats a vertex of the surface: its place, 1 unused, its unit normal, 1 unused.
+  write(out, first, pose) {
+    const { local, turns, shifts } = this.chain(pose), rest = this.shaped(local), count = rest.length / 3;
+    const start = 8 * first;
+    for (let n = 0, o = start; n < count; n++, o += 8) {
+      const x = rest[3 * n], y = rest[3 * n + 1], z = rest[3 * n + 2];
+      let a = 0, b = 0, c = 0;
       for (let k = 4 * n; k < 4 * n + 4; k++) {
         const w = this.weights[k];
         if (!w) continue;
-        const turn = turns[this.influences[k]], shift = shifts[this.influences[k]];
-        for (let i = 0; i < 9; i++) A[i] += w * turn[i];
-        tx += w * shift[0]; ty += w * shift[1]; tz += w * shift[2]; total += w;
+        const m = turns[this.bones[k]], s = shifts[this.bones[k]];
+        a += w * (m[0] * x + m[1] * y + m[2] * z + s[0]);
+        b += w * (m[3] * x + m[4] * y + m[5] * z + s[1]);
+        c += w * (m[6] * x + m[7] * y + m[8] * z + s[2]);
       }
-      for (let i = 0; i < 9; i++) A[i] /= total;
-      const e = 8 * n;
-      const x = m[3 * n] + (add ? add[e] : 0), y = m[3 * n + 1] + (add ? add[e + 1] : 0);
-      const z = m[3 * n + 2] + (add ? add[e + 2] : 0);
-      out[o] = A[0] * x + A[1] * y + A[2] * z + tx / total;
-      out[o + 1] = A[3] * x + A[4] * y + A[5] * z + ty / total;
-      out[o + 2] = A[6] * x + A[7] * y + A[8] * z + tz / total;
-      out[o + 3] = Math.min(Math.max(this.opacities[n] + (add ? add[e + 6] : 0), 0), 1);
-      const s = 6 * n, wide = add ? Math.exp(2 * add[e + 7]) : 1;
-      const xx = wide * c[s], xy = wide * c[s + 1], xz = wide * c[s + 2];
-      const yy = wide * c[s + 3], yz = wide * c[s + 4], zz = wide * c[s + 5];
-      for (let i = 0; i < 9; i += 3) {
-        B[i] = A[i] * xx + A[i + 1] * xy + A[i + 2] * xz;
-        B[i + 1] = A[i] * xy + A[i + 1] * yy + A[i + 2] * yz;
-        B[i + 2] = A[i] * xz + A[i + 1] * yz + A[i + 2] * zz;
-      }
-      out[o + 4] = B[0] * A[0] + B[1] * A[1] + B[2] * A[2];
-      out[o + 5] = B[0] * A[3] + B[1] * A[4] + B[2] * A[5];
-      out[o + 6] = B[0] * A[6] + B[1] * A[7] + B[2] * A[8];
-      out[o + 7] = B[3] * A[3] + B[4] * A[4] + B[5] * A[5];
-      out[o + 8] = B[3] * A[6] + B[4] * A[7] + B[5] * A[8];
-      out[o + 9] = B[6] * A[6] + B[7] * A[7] + B[8] * A[8];
-      let gain = 1;
-      if (light) {
-        const p = this.restNormals[3 * n], q = this.restNormals[3 * n + 1];
-        const r = this.restNormals[3 * n + 2];
-        const u = A[0] * p + A[1] * q + A[2] * r, v = A[3] * p + A[4] * q + A[5] * r;
-        const w = A[6] * p + A[7] * q + A[8] * r;
-        const facing = (u * light.x + v * light.y + w * light.z) / (Math.hypot(u, v, w) || 1);
-        gain = 1 - light.strength + light.strength * (0.35 + 1.1 * Math.max(0, facing));
-      }
-      for (let i = 0; i < 3; i++)
-        out[o + 12 + i] = (rgb[3 * n + i] + (add ? add[e + 3 + i] : 0)) * gain;
-      if (shown === "weights" && this.trusted) {
-        const weight = this.trusted[n], color = weight > 254 ? UNWEIGHED : ramp(weight / 254);
-        for (let i = 0; i < 3; i++) out[o + 12 + i] = color[i];
-      }
-      if (marks && this.seen) {
-        const unseen = 1 - this.seen[n] / 255;
-        for (let i = 0; i < 3; i++) out[o + 12 + i] += unseen * (UNSEEN[i] - out[o + 12 + i]);
-      }
+      out[o] = a; out[o + 1] = b; out[o + 2] = c;
     }
+    out.fill(0, start + 8 * count, start + 8 * this.vertices);
+    for (let n = 0, o = start; n < count; n++, o += 8) out[o + 4] = out[o + 5] = out[o + 6] = 0;
+    for (let f = 0; f < this.faces.length; f += 3) {
+      const [i, j, k] = [0, 1, 2].map((c) => start + 8 * this.faces[f + c]);
+      const a = out[j] - out[i], b = out[j + 1] - out[i + 1], c = out[j + 2] - out[i + 2];
+      const p = out[k] - out[i], q = out[k + 1] - out[i + 1], r = out[k + 2] - out[i + 2];
+      const x = b * r - c * q, y = c * p - a * r, z = a * q - b * p;
+      for (const o of [i, j, k]) { out[o + 4] += x; out[o + 5] += y; out[o + 6] += z; }
+    }
+    for (let n = 0, o = start; n < count; n++, o += 8) {
+      const length = Math.sqrt(out[o + 4] ** 2 + out[o + 5] ** 2 + out[o + 6] ** 2);
+      if (length > 0) { out[o + 4] /= length; out[o + 5] /= length; out[o + 6] /= length; }
+      else out[o + 6] = 1;
+    }
+    if (this.border.length) this.close(out, start, count);
+  }
+  // The plane of the open wrist; its normal points into the hand (wildghand/model/wrist.py).
+  close(out, start, count) {
+    const at = (o) => [out[o], out[o + 1], out[o + 2]], border = this.border.map((v) => at(start + 8 * v));
+    const mean = (places) => [0, 1, 2].map((i) => places.reduce((sum, p) => sum + p[i], 0) / places.length);
+    const centre = mean(border), spokes = border.map((p) => p.map((v, i) => v - centre[i]));
+    const normal = [0, 0, 0];
+    spokes.forEach(([a, b, c], l) => {
+      const [p, q, r] = spokes[(l + 1) % spokes.length];
+      normal[0] += b * r - c * q; normal[1] += c * p - a * r; normal[2] += a * q - b * p;
+    });
+    const middle = mean(Array.from({ length: count }, (_, n) => at(start + 8 * n)));
+    const inwards = normal.reduce((sum, v, i) => sum + v * (middle[i] - centre[i]), 0);
+    const scale = (inwards < 0 ? -1 : 1) / Math.hypot(...normal);
+    [centre, ...border].forEach((place, l) => {
+      out.set([...place, 0, ...normal.map((v) => v * scale)], start + 8 * (count + l));
+    });
   }
 }

@@ -1,6 +1,5 @@
 // Draws Gaussians with WebGL2, by the conventions of wildghand/splat/conventions.py.
 "use strict";
-const WIDTH = 2048; // Texels in a row of the texture; 4 texels a Gaussian.
 
 const VERTEX = `#version 300 es
 precision highp float; precision highp int; precision highp sampler2D;
@@ -51,20 +50,48 @@ const WHOLE = `#version 300 es
 void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.0, 1.0); }`;
 const COMPOSE = `#version 300 es
 precision highp float;
-uniform sampler2D drawn; uniform vec3 background;
+uniform sampler2D drawn; uniform vec3 background; uniform vec2 size; uniform float soft;
 out vec4 color;
 void main() {
   vec4 c = texelFetch(drawn, ivec2(gl_FragCoord.xy), 0);
-  color = vec4(clamp(c.rgb + (1.0 - c.a) * background, 0.0, 1.0), 1.0);
+  // Brightest a little above the middle.
+  float away = length((gl_FragCoord.xy - size * vec2(0.5, 0.56)) / max(size.x, size.y));
+  vec3 behind = background * (1.0 - soft * smoothstep(0.0, 0.75, away));
+  color = vec4(clamp(c.rgb + (1.0 - c.a) * behind, 0.0, 1.0), 1.0);
 }`;
 
+function compile(gl, sources, varyings) {
+  const made = gl.createProgram();
+  sources.forEach((source, i) => {
+    const shader = gl.createShader(i ? gl.FRAGMENT_SHADER : gl.VERTEX_SHADER);
+    gl.shaderSource(shader, source);
+    gl.compileShader(shader);
+    gl.attachShader(made, shader);
+  });
+  if (varyings) gl.transformFeedbackVaryings(made, varyings, gl.INTERLEAVED_ATTRIBS);
+  gl.linkProgram(made);
+  if (!gl.getProgramParameter(made, gl.LINK_STATUS)) {
+    const logs = gl.getAttachedShaders(made).map((shader) => gl.getShaderInfoLog(shader));
+    throw new Error([gl.getProgramInfoLog(made), ...logs].join(" "));
+  }
+  return made;
+}
+function nearest(gl) {
+  const texture = gl.createTexture();
+  gl.bindTexture(gl.TEXTURE_2D, texture);
+  for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER])
+    gl.texParameteri(gl.TEXTURE_2D, side, gl.NEAREST);
+  return texture;
+}
+
 class Splats {
-  constructor(canvas, count) {
+  constructor(canvas, content, hands) {
     const gl = canvas.getContext("webgl2", { antialias: false, alpha: false });
     if (!gl) throw new Error("WebGL2 is absent");
     this.gl = gl;
+    this.gaussians = new Gaussians(gl, content, hands);
+    const { count } = this.gaussians;
     this.count = count;
-    this.data = new Float32Array(4 * WIDTH * Math.ceil((4 * count) / WIDTH));
     this.order = new Uint32Array(count);
     this.scratch = new Uint32Array(count);
     this.depths = new Float32Array(count);
@@ -74,9 +101,8 @@ class Splats {
     const half = full || gl.getExtension("EXT_color_buffer_half_float");
     const blends = full && gl.getExtension("EXT_float_blend");
     this.format = blends ? gl.RGBA32F : half ? gl.RGBA16F : gl.RGBA8;
-    this.painter = this.program(VERTEX, FRAGMENT);
-    this.composer = this.program(WHOLE, COMPOSE);
-    this.texture = this.makeTexture();
+    this.painter = compile(gl, [VERTEX, FRAGMENT]);
+    this.composer = compile(gl, [WHOLE, COMPOSE]);
     this.target = gl.createFramebuffer();
     this.shapes = gl.createVertexArray();
     gl.bindVertexArray(this.shapes);
@@ -88,33 +114,10 @@ class Splats {
     gl.vertexAttribDivisor(which, 1);
     this.empty = gl.createVertexArray();
   }
-  program(...sources) {
-    const gl = this.gl, made = gl.createProgram();
-    sources.forEach((source, i) => {
-      const shader = gl.createShader(i ? gl.FRAGMENT_SHADER : gl.VERTEX_SHADER);
-      gl.shaderSource(shader, source);
-      gl.compileShader(shader);
-      gl.attachShader(made, shader);
-    });
-    gl.linkProgram(made);
-    if (!gl.getProgramParameter(made, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(made));
-    return made;
-  }
-  makeTexture() {
-    const gl = this.gl, texture = gl.createTexture();
-    gl.bindTexture(gl.TEXTURE_2D, texture);
-    for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER])
-      gl.texParameteri(gl.TEXTURE_2D, side, gl.NEAREST);
-    return texture;
-  }
-  upload() {
-    const gl = this.gl, rows = this.data.length / 4 / WIDTH;
-    gl.bindTexture(gl.TEXTURE_2D, this.texture);
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, WIDTH, rows, 0, gl.RGBA, gl.FLOAT, this.data);
-  }
   // Far to near; of equal depths the later index first, since it lies behind.
   sort(view) {
-    const { data, count, depths, keys } = this, [a, b, c] = view.turn.slice(6), t = view.shift[2];
+    const { count, depths, keys } = this, [a, b, c] = view.turn.slice(6), t = view.shift[2];
+    const { data } = this.gaussians;
     for (let n = 0, o = 0; n < count; n++, o += 16) {
       const z = a * data[o] + b * data[o + 1] + c * data[o + 2] + t;
       depths[n] = z > 0 ? z : 0;
@@ -139,14 +142,16 @@ class Splats {
     canvas.width = width;
     canvas.height = height;
     if (this.drawn) gl.deleteTexture(this.drawn);
-    this.drawn = this.makeTexture();
+    this.drawn = nearest(gl);
     gl.texStorage2D(gl.TEXTURE_2D, 1, this.format, width, height);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.drawn, 0);
   }
   // view: turn (9) and shift (3), world to camera; lens [fx, fy, cx, cy] px; width, height px.
-  draw(view, background) {
+  // background: colour, and by how much it is darker at its edge.
+  draw(view, background, soft) {
     const gl = this.gl, { width, height } = view;
+    gl.activeTexture(gl.TEXTURE0);
     this.resize(width, height);
     this.sort(view);
     gl.viewport(0, 0, width, height);
@@ -161,7 +166,7 @@ class Splats {
     gl.uniform3fv(at("shift"), view.shift);
     gl.uniform4fv(at("lens"), view.lens);
     gl.uniform2f(at("size"), width, height);
-    gl.bindTexture(gl.TEXTURE_2D, this.texture);
+    gl.bindTexture(gl.TEXTURE_2D, this.gaussians.textures.made.name);
     gl.bindVertexArray(this.shapes);
     gl.bindBuffer(gl.ARRAY_BUFFER, this.buffer);
     gl.bufferData(gl.ARRAY_BUFFER, this.order, gl.DYNAMIC_DRAW);
@@ -170,6 +175,8 @@ class Splats {
     gl.disable(gl.BLEND);
     gl.useProgram(this.composer);
     gl.uniform3fv(gl.getUniformLocation(this.composer, "background"), background);
+    gl.uniform2f(gl.getUniformLocation(this.composer, "size"), width, height);
+    gl.uniform1f(gl.getUniformLocation(this.composer, "soft"), soft);
     gl.bindTexture(gl.TEXTURE_2D, this.drawn);
     gl.bindVertexArray(this.empty);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
