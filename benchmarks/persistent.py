@@ -115,8 +115,8 @@ def _page(results: Sequence[Results], table: Table) -> str:
         [
             "# Scores over the share of clean frames",
             "",
-            "This page is written by `benchmarks/persistent.py` from result files. The captures are",
-            "[perturbed for most of their time](simulation.md#persistent-perturbations).",
+            "This page is written by `benchmarks/persistent.py` from result files. In its captures",
+            "[perturbations last](simulation.md#persistent-perturbations).",
             "",
             "| | |",
             "| --- | --- |",
