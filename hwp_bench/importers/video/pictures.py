@@ -151,8 +151,8 @@ class LitTexture:
     small least squares. A shadow that the hand casts on itself is in neither.
     """
 
-    #: Edge of the map, texels; more change nothing.
-    EDGE = 160
+    #: Edge of the map, texels.
+    EDGE = 256
     #: Added to colours before the logarithm: noise of dark pixels counts less.
     DARK = 0.04
     # Logarithm of a colour: a frame that differs by more counts less.
@@ -480,8 +480,8 @@ class TextureResidual(SurfaceResidual):
 
     #: Weight, and difference of a pixel that is still normal, log grey.
     WEIGHT, SCALE = 770.0, 0.06
-    #: Edge of the texture's map, texels.
-    EDGE = 256
+    #: Edge of the texture's map, texels; fewer cost 3 % of the hand's shape.
+    EDGE = 384
     # Frames that a texel must have been seen in, each weighed by its facing squared.
     _LEAST_WEIGHT = 5.0
     # Log grey: a frame that differs from the mean by more counts less in the next mean.
