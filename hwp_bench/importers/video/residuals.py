@@ -296,9 +296,9 @@ REACH = 0.06
 # Outline error in the image, as a share of the hand's size in the image.
 _OUTLINE_SCALE = 0.007
 # Weight of one outline vertex; neighbours agree, so each counts little.
-_OUTLINE_WEIGHT = 0.4
+_OUTLINE_WEIGHT = 0.2
 # Outline vertices of each frame.
-_OUTLINE_COUNT = 100
+_OUTLINE_COUNT = 200
 # Vertices of the outline lie at most this far inside the silhouette, px of the field.
 _OUTLINE_WITHIN = 1.6
 # Step of the search along a normal, px of the field.

@@ -60,7 +60,7 @@ def test_a_mask_without_outline_has_no_field(level: int) -> None:
 @pytest.mark.parametrize("growth", [-4.0, 0.0, 3.0, 5.0])
 def test_outline_vertices_are_drawn_along_their_normals(growth: float) -> None:
     centre, radius = np.array([96.0, 96.0]), 40.0
-    vertices, faces = disc(centre, radius, corners=96)
+    vertices, faces = disc(centre, radius)
     field = signed_distance(disc_mask(centre, radius + growth))
     found = match_outline(vertices, faces, np.arange(len(vertices)), field, reach=8.0)
     used = np.abs(found.normal).sum(axis=1) > 0
