@@ -254,7 +254,7 @@ def write_page(
         overwrite: replace what exists.
 
     Raises:
-        BadInput: no avatar of `wildghand fit`.
+        BadInput: no avatar of `wildghand fit`, or one with numbers that are not finite.
         UsageError: `out` exists, or the capture is of other hands or another hand model.
         HwpError: the place cannot be written.
     """
@@ -264,6 +264,7 @@ def write_page(
     if isinstance(avatar, Path):
         avatar = load_avatar(avatar, hand=hand)
     samples = sample_poses(avatar, capture, settings)
+    avatar.pose(dict(samples.start), closed=True).require_finite()
     network = network_content(avatar)
     hands = {
         side: hand_content(

@@ -108,6 +108,7 @@ def test_lists_speak_json(capsys) -> None:
     assert [row["capture"] for row in value["captures"]] == [f"capture{i}" for i in range(11)]
     suites = ["smoke", "mini", "full-lite", "full", "wild-dev", "wild-test", "persistent"]
     suites += [f"persistent-clean{percent}" for percent in (0, 20, 35, 60)]
+    suites.append("real-1")
     assert [row["suite"] for row in value["suites"]] == suites
     assert "plain" in [row["method"] for row in value["methods"]]
 

@@ -114,7 +114,6 @@ def test_motion_and_pages_play_what_is_believed(
         samples = sample_poses(tiny_avatar, capture, PageSettings())
         moved = samples.motion["right"][:, :48] - before.motion["right"][:, :48]
         np.testing.assert_allclose(moved, 0.05, atol=1e-6)
-        np.testing.assert_allclose(samples.start["right"].pose, bent, atol=1e-6)
         path = tmp_path / "hand.glb"
         export(tiny_avatar, path, ExportSettings(mesh=True), capture=capture)
         played = _first_quaternion(path)

@@ -175,8 +175,9 @@ def test_the_page_of_a_fit_shows_its_steps_and_pictures(
         served.glimpse([PaintedHand(hand.vertices, hand.faces, red)])
 
         def reds() -> int:
+            # Redder than the skin of the painted frames.
             pixels = window(driver).astype(int)
-            return int((pixels[..., 0] - pixels[..., 1:].max(axis=-1) > 60).sum())
+            return int((pixels[..., 0] > 60 + 3 * pixels[..., 1:].max(axis=-1)).sum())
 
         wait_until(lambda: reds() > 2000)
         fit_capture(make_painted().root, settings=settings, watch=served.watch)
