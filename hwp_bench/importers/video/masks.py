@@ -227,7 +227,7 @@ def segment_clip(
         if not drawn.detected:
             return None
         lab = to_lab(image(frame))
-        hand, other = _sure(drawn, hand_size, settings)
+        hand, other, _ = _sure(drawn, hand_size, settings)
         return lab[hand], lab[other]
 
     samples = each_frame(sample, chosen.tolist())
@@ -255,11 +255,10 @@ def _segment(
     if model is None or not prompt.silhouette.any():
         skin = prompt.silhouette
     else:
-        inside, outside = _sure(prompt, hand_size, settings)
-        far = _distance(prompt.silhouette) > _FOREARM * hand_size
+        inside, outside, distance = _sure(prompt, hand_size, settings)
         labels = np.full(inside.shape, cv2.GC_PR_BGD, dtype=np.uint8)
         labels[prompt.silhouette > 0] = cv2.GC_PR_FGD
-        labels[outside | far] = cv2.GC_BGD
+        labels[outside | (distance > _FOREARM * hand_size)] = cv2.GC_BGD
         # What is surely not hand decides nothing, and costs as much as the rest.
         open_ = surrounding(labels != cv2.GC_BGD, 2)
         lab, labels = to_lab(image[open_]), np.ascontiguousarray(labels[open_])
@@ -284,13 +283,14 @@ def to_lab(image: np.ndarray) -> np.ndarray:
 
 def _sure(
     prompt: Prompt, hand_size: float, settings: MaskSettings
-) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels deep inside the silhouette, and pixels far outside that are not forearm."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pixels deep inside the silhouette, those far outside that are not forearm, and distances."""
     depth = cv2.distanceTransform(prompt.silhouette, cv2.DIST_L2, 3)
     distance = cv2.distanceTransform(255 - prompt.silhouette, cv2.DIST_L2, 3)
     return (
         depth > settings.inside * hand_size,
         (distance > settings.outside * hand_size) & ~prompt.beyond,
+        distance,
     )
 
 
