@@ -145,6 +145,15 @@ def read_tensors(path: str | os.PathLike[str], max_bytes: int) -> dict[str, Tens
     return {name: value for name, value in loaded.items() if isinstance(value, torch.Tensor)}
 
 
+def surrounding(region: np.ndarray, margin: int) -> tuple[slice, slice]:
+    """Rows and columns of a region (H, W) bool, not empty, with a margin where the image has it."""
+    rows, columns = (np.flatnonzero(region.any(axis=axis)) for axis in (1, 0))
+    return (
+        slice(max(int(rows[0]) - margin, 0), int(rows[-1]) + 1 + margin),
+        slice(max(int(columns[0]) - margin, 0), int(columns[-1]) + 1 + margin),
+    )
+
+
 def evenly(count: int, most: int) -> np.ndarray:
     """Choose at most some of `count` things in a row, from the first to the last.
 

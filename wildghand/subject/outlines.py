@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from scipy.ndimage import gaussian_filter
 
+from hwp_bench.base.arrays import surrounding
 from hwp_bench.capture import Cameras
 from hwp_bench.hands import HandParameters, HandTemplate, boundary_vertices, pose_hand, project
 from hwp_bench.hands.raster import draw_faces
@@ -78,7 +79,7 @@ def compare_outlines(
             outward=np.zeros((0, 2)),
             gap=np.zeros(0),
         )
-    window = _around(area)
+    window = surrounding(area, _MARGIN)
     drawn = area[window]
     mine = outward_distance(drawn)
     rim = np.zeros(area.shape, dtype=bool)
@@ -98,16 +99,6 @@ def compare_outlines(
         mix=np.column_stack([1.0 - second.sum(axis=1), second]),
         outward=here[alike],
         gap=gap[alike],
-    )
-
-
-def _around(area: np.ndarray) -> tuple[slice, slice]:
-    """The rows and columns of a bool area, not empty, and of what its outline is read from."""
-    rows, columns = (np.flatnonzero(area.any(axis=axis)) for axis in (1, 0))
-    first = max(int(rows[0]) - _MARGIN, 0), max(int(columns[0]) - _MARGIN, 0)
-    return (
-        slice(first[0], int(rows[-1]) + _MARGIN + 1),
-        slice(first[1], int(columns[-1]) + _MARGIN + 1),
     )
 
 

@@ -131,15 +131,6 @@ def cells(places: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.nd
     return rows, columns, inside
 
 
-def surrounding(region: np.ndarray, margin: int) -> tuple[slice, slice]:
-    """Rows and columns of a region (H, W) bool, not empty, with a margin where the image has it."""
-    rows, columns = (np.flatnonzero(region.any(axis=axis)) for axis in (1, 0))
-    return (
-        slice(max(int(rows[0]) - margin, 0), int(rows[-1]) + 1 + margin),
-        slice(max(int(columns[0]) - margin, 0), int(columns[-1]) + 1 + margin),
-    )
-
-
 def each_frame(work: Callable[[Frame], Result], frames: Iterable[Frame]) -> Iterator[Result]:
     """Call a function for each frame in several threads."""
     threads = min(MOST_THREADS, os.cpu_count() or 1)

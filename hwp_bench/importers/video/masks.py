@@ -16,15 +16,10 @@ import cv2
 import numpy as np
 import torch
 
+from hwp_bench.base.arrays import surrounding
 from hwp_bench.hands.raster import draw_faces, draw_silhouette, overlap
 from hwp_bench.hands.template import boundary_vertices
-from hwp_bench.importers.shared.frames import (
-    CropWindows,
-    cells,
-    each_frame,
-    resample,
-    surrounding,
-)
+from hwp_bench.importers.shared.frames import CropWindows, cells, each_frame, resample
 from hwp_bench.importers.shared.landmarks import Landmarks
 from hwp_bench.importers.shared.output import ProjectedHand
 from hwp_bench.importers.video.decode import ClipImages

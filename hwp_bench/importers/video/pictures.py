@@ -16,11 +16,12 @@ import cv2
 import numpy as np
 import torch
 
+from hwp_bench.base.arrays import surrounding
 from hwp_bench.base.colors import COUNT, harmonics
 from hwp_bench.base.kernels import compiled
 from hwp_bench.hands import HandTemplate
 from hwp_bench.hands.raster import draw_faces, mix_corners
-from hwp_bench.importers.shared.frames import CropWindows, each_frame, surrounding
+from hwp_bench.importers.shared.frames import CropWindows, each_frame
 from hwp_bench.importers.video.model import (
     FRAME_VARIABLES,
     ClipModel,
