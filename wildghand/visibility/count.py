@@ -14,6 +14,8 @@ from wildghand.gaussians.training import TrainingClip
 
 #: Cosine between normal and viewing direction from which a frame counts.
 FACING = 0.1
+# Frames that show skin, each by how much it counts.
+_SHOWN = 0.1
 # How far an anchor may lie behind the nearest one in its surroundings and still be seen, m: the
 # surface is slanted there, and a finger is thicker.
 _BEHIND = 0.006
@@ -52,9 +54,9 @@ def shown_frames(
 def never_shown(shown: Tensor, near: Tensor) -> Tensor:
     """(N,) bool, the Gaussians amid skin that no training frame shows.
 
-    Skin is shown where the median of a place and its neighbours is a frame or more: a single place
-    may be taken for a shown one. Next to it Gaussians are free too, because they may have to reach
-    beyond the hand model there.
+    Skin is shown where the median of a place and its neighbours is a tenth of a frame or more: a
+    single place may be taken for a shown one. Next to it Gaussians are free too, because they may
+    have to reach beyond the hand model there.
 
     Args:
         shown: (N,) frames that show each.
@@ -65,7 +67,7 @@ def never_shown(shown: Tensor, near: Tensor) -> Tensor:
         beside = torch.where(near >= 0, values[near.clamp(min=0)], torch.nan)
         return torch.cat([values[:, None], beside], dim=1)
 
-    skin = around(shown).nanmedian(dim=1).values >= 1.0
+    skin = around(shown).nanmedian(dim=1).values >= _SHOWN
     return around(skin.to(shown)).nan_to_num(0.0).amax(dim=1) < 0.5
 
 

@@ -11,6 +11,7 @@ import dataclasses
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -101,19 +102,33 @@ def test_the_page_draws_training_poses_as_the_avatar(opened, fitted) -> None:
         assert psnr(drawn(opened, capture, frame), truth[..., :3], truth[..., 3]) > LEAST
 
 
+@pytest.mark.parametrize("turn", [60, 180, 270])
+def test_the_page_draws_a_hand_from_where_no_camera_stood(turn: int, opened, fitted) -> None:
+    avatar, _ = fitted
+    hands, camera = avatar.studio.posed("rest", turn), avatar.studio.camera(96, 96)
+    assert bool((avatar.model.visibility.shapes["right"] == 0.0).any())
+    hand = hands["right"]
+    given = {"right": [hand.pose.tolist(), hand.transl.tolist()]}
+    opened.execute_script("avatar.setPose(arguments[0])", given)
+    seen = SimpleNamespace(camera=lambda frame: camera)
+    truth = avatar.render(hands, camera)
+    assert psnr(drawn(opened, seen, 0), truth[..., :3], truth[..., 3]) > LEAST
+
+
 def biased(avatar: WildGHandAvatar, capture: Capture, frame: int) -> np.ndarray:
     """(H, W, 4) of the model's Gaussians with the biases of a training frame."""
     given = avatar.posed({"right": capture.hand_poses(frame)["right"]})["right"]
     rows, camera = torch.tensor([avatar.record.frames.index(frame)]), capture.camera(frame)
     with torch.no_grad():
-        made, _ = avatar.model.gaussians("right", *given, rows=rows)
+        viewmats = torch.as_tensor(camera.viewmat[None], dtype=torch.float32)
+        made, _ = avatar.model.gaussians("right", *given, rows=rows, viewmats=viewmats)
         image, cover, _ = rasterize(
             made.means,
             made.quats,
             made.scales,
             made.opacities,
             made.colors,
-            torch.as_tensor(camera.viewmat[None], dtype=torch.float32),
+            viewmats,
             torch.as_tensor(camera.K[None], dtype=torch.float32),
             camera.width,
             camera.height,
