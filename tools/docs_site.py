@@ -1,8 +1,9 @@
 """Builds the documentation site: `mkdocs build --strict` reads `mkdocs.yml`, which loads this.
 
 It adds pages that are not files below `docs/` (the README as home, the files at the root that
-contributors read, the page of each baseline, one page of API reference for each public package),
-and gives the reference the `#:` comments that document fields and constants.
+contributors read, the page of each baseline, one page of API reference for each public package, and
+one of the tables of scene files), and gives the reference the `#:` comments that document fields
+and constants.
 """
 
 from __future__ import annotations
@@ -36,6 +37,35 @@ API = (
     "wildghand",
     "wildghand.splat",
 )
+#: The records behind a scene file: the heading of a table, and its class in `hwp_bench.sim`.
+SCENE_TABLES = {
+    "top": "scene.scene.Scene",
+    "camera": "scene.scene.SceneCamera",
+    "track": "scene.scene.Track",
+    "keys of hands": "scene.scene.HandKey",
+    "estimator": "scene.scene.Estimator",
+    "subject": "subject.subject.Subject",
+    "subject.anatomy": "hand.anatomy.SubjectAnatomy",
+    "subject.looks": "subject.subject.Looks",
+    "tattoos": "subject.wear.Tattoo",
+    "polish": "subject.wear.Polish",
+    "rings": "subject.wear.Ring",
+    "wrist": "subject.wear.WristWear",
+    "gloves": "subject.wear.Glove",
+    "light": "light.lights.Light",
+    "light.lamps": "light.lights.Lamp",
+    "light.room": "light.lights.Room",
+    "sensor": "sensor.Sensor",
+    "sensor.auto": "sensor.AutoControl",
+    "behind.clutter": "props.behind.Clutter",
+    "behind.face": "props.behind.Face",
+    "behind.arm": "props.behind.OtherArm",
+    "effects: hand_object_interaction": "effects.ObjectInteraction",
+    "items of hand_object_interaction": "effects.ObjectItem",
+    "effects: complex_poses": "effects.ComplexPoses",
+    "effects: illumination": "effects.Illumination",
+    "effects: motion_blur": "effects.MotionBlur",
+}
 
 _LINK = re.compile(r"\]\((?!https?://|#)([^)\s#]+)((?:#[^)\s]*)?)\)")
 
@@ -55,7 +85,18 @@ def on_files(files: Files, *, config: MkDocsConfig) -> Files:
         options = f"    options:\n      members: {public}\n" if public else ""
         text = f"# `{package}`\n\n::: {package}\n{options}"
         files.append(File.generated(config, f"api/{package}.md", content=text))
+    files.append(File.generated(config, "api/scenes.md", content=_scene_page()))
     return files
+
+
+def _scene_page() -> str:
+    """The reference of scene files: every field with its meaning, default and range."""
+    options = "    options: {show_attribute_values: true, heading_level: 3}\n"
+    tables = [
+        f"## {title}\n\n::: hwp_bench.sim.{name}\n{options}" for title, name in SCENE_TABLES.items()
+    ]
+    head = "# Scene files\n\nThe fields of [a scene](../simulation.md#a-scene), table by table.\n\n"
+    return head + "\n".join(tables)
 
 
 def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: Files) -> str:
