@@ -8,10 +8,12 @@ and constants.
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
+import inspect
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from griffe import Attribute, Docstring, Extension
 from mkdocs.config.defaults import MkDocsConfig
@@ -90,13 +92,52 @@ def on_files(files: Files, *, config: MkDocsConfig) -> Files:
 
 
 def _scene_page() -> str:
-    """The reference of scene files: every field with its meaning, default and range."""
-    options = "    options: {show_attribute_values: true, heading_level: 3}\n"
-    tables = [
-        f"## {title}\n\n::: hwp_bench.sim.{name}\n{options}" for title, name in SCENE_TABLES.items()
-    ]
-    head = "# Scene files\n\nThe fields of [a scene](../simulation.md#a-scene), table by table.\n\n"
-    return head + "\n".join(tables)
+    """The reference of scene files: every field with its default, range and meaning."""
+    parts = ["# Scene files", "", "The fields of [a scene](../simulation.md#a-scene), by table."]
+    for title, name in SCENE_TABLES.items():
+        module, _, record = name.rpartition(".")
+        kind = getattr(importlib.import_module(f"hwp_bench.sim.{module}"), record)
+        parts += [
+            "",
+            f"## {title}",
+            "",
+            "| field | default | range | meaning |",
+            "| - | - | - | - |",
+        ]
+        parts += _field_rows(kind)
+    return "\n".join(parts) + "\n"
+
+
+def _field_rows(record: type) -> list[str]:
+    source = re.findall(r"((?:^    #: .*\n)+)    (\w+):", inspect.getsource(record), re.MULTILINE)
+    meanings = {name: " ".join(comment.replace("#:", "").split()) for comment, name in source}
+    hints = get_type_hints(record, include_extras=True)
+    rows = []
+    for field in dataclasses.fields(record):
+        default = field.default
+        if default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
+            shown = "required"
+        else:
+            # Tables and lists have a heading of their own.
+            plain = isinstance(default, str | int | float | tuple) and default != ()
+            shown = f"`{default}`" if plain else ""
+        meaning = meanings.get(field.name, "").replace("|", "\\|")
+        rows.append(f"| `{field.name}` | {shown} | {_range(field, hints)} | {meaning} |")
+    return rows
+
+
+def _range(field: dataclasses.Field[Any], hints: dict[str, Any]) -> str:
+    if field.metadata.get("range"):
+        return "{:g} to {:g}".format(*field.metadata["range"])
+    hint = hints[field.name]
+    for part in (hint, *get_args(hint)):
+        if get_origin(part) is Literal:
+            return ", ".join(f"`{word}`" for word in get_args(part))
+        bounds = [meta for meta in getattr(part, "__metadata__", ()) if hasattr(meta, "ge")]
+        if bounds and bounds[0].le is not None:
+            low, high = bounds[0].ge, bounds[0].le
+            return f"{low:g} to {high:g}" if high < 1e9 else f"from {low:g}"
+    return ""
 
 
 def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: Files) -> str:
