@@ -64,8 +64,8 @@ def never_shown(shown: Tensor, near: Tensor) -> Tensor:
     """
 
     def around(values: Tensor) -> Tensor:
-        beside = torch.where(near >= 0, values[near.clamp(min=0)], torch.nan)
-        return torch.cat([values[:, None], beside], dim=1)
+        neighbours = torch.where(near >= 0, values[near.clamp(min=0)], torch.nan)
+        return torch.cat([values[:, None], neighbours], dim=1)
 
     skin = around(shown).nanmedian(dim=1).values >= _SHOWN
     return around(skin.to(shown)).nan_to_num(0.0).amax(dim=1) < 0.5
