@@ -71,7 +71,7 @@ def find_hard(
 
 
 def soft_target(unlikeness: torch.Tensor, hand: torch.Tensor) -> torch.Tensor:
-    """What the soft mask learns: 1 at the hand's most alike pixel, 0 at the least, (H, W).
+    """Goal of the soft mask: 1 at the hand's most alike pixel, 0 at the least, (H, W).
 
     Source: the code of Li et al., "Asymmetric Dual 3DGS".
     """

@@ -115,7 +115,7 @@ class DelayedMaskRecipe(PlainRecipe[DelayedMaskSettings]):
     def _teach(
         self, batch: Batch, drawing: Drawing, chance: torch.Tensor, hand: torch.Tensor
     ) -> torch.Tensor:
-        """What the network has to learn of a batch, as a loss of its chances (P,)."""
+        """The loss of the chances (P,) that the network gives the pixels of a batch."""
         settings = self.settings
         coarse = batch.fraction < settings.coarse_until
         image, target = drawing.image.detach(), batch.images

@@ -11,8 +11,8 @@ from torch.nn.functional import adaptive_avg_pool2d
 
 from hwp_bench.methods.contract import Avatar
 from hwp_bench.methods.settings import number
-from wildghand.gaussians.hand_avatar import DrawnAvatar, PosedHands
-from wildghand.plain.model import PlainAvatar
+from wildghand.gaussians.hand_avatar import PosedHands
+from wildghand.plain.model import PlainAvatar, PlainModel
 from wildghand.plain.recipe import Batch, Drawing, FitInputs, FitSettings, PlainRecipe, RecipeMethod
 
 #: Numbers of a frame: its exposure in stops, and where four chromaticities go, two each.
@@ -86,7 +86,7 @@ def start_controller(seed: int, device: torch.device) -> dict[str, torch.Tensor]
 
 
 def shrink(image: torch.Tensor) -> torch.Tensor:
-    """What the controller sees of (B, H, W, 3): means in 15 x 15 parts, without gradient."""
+    """Means of (B, H, W, 3) in 15 x 15 parts, for the controller; without gradient."""
     return adaptive_avg_pool2d(image.detach().movedim(-1, 1), SEEN).movedim(1, -1)
 
 
@@ -107,6 +107,32 @@ class DevelopedDrawing(Drawing):
 
     #: (B, H, W, 3) the model's own colours over black.
     radiance: torch.Tensor
+
+
+class ExposedAvatar(PlainAvatar):
+    """The plain avatar with the exposure and the chromaticity that a controller predicts.
+
+    Args:
+        controller: its tensors; while the fit goes on they may be the live ones.
+    """
+
+    def __init__(
+        self, model: PlainModel, steps: int, controller: Mapping[str, torch.Tensor]
+    ) -> None:
+        super().__init__(model, steps)
+        self._controller = controller
+
+    def draw(
+        self,
+        hands: PosedHands,
+        viewmats: torch.Tensor,
+        Ks: torch.Tensor,
+        width: int,
+        height: int,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """See `HandAvatar.draw`."""
+        image, coverage = super().draw(hands, viewmats, Ks, width, height)
+        return develop(image, predict(shrink(image), self._controller)), coverage
 
 
 class ZeroMeanExposureRecipe(PlainRecipe[ZeroMeanExposureSettings]):
@@ -163,15 +189,7 @@ class ZeroMeanExposureRecipe(PlainRecipe[ZeroMeanExposureSettings]):
 
     def avatar(self, steps: int) -> Avatar:
         """The plain avatar, whose images the controller exposes."""
-        plain = PlainAvatar(self.model, steps)
-
-        def draw(
-            hands: PosedHands, viewmats: torch.Tensor, Ks: torch.Tensor, width: int, height: int
-        ) -> tuple[torch.Tensor, torch.Tensor]:
-            image, coverage = plain.draw(hands, viewmats, Ks, width, height)
-            return develop(image, predict(shrink(image), self.controller)), coverage
-
-        return DrawnAvatar(draw, self.model.rigs, self.device, steps)
+        return ExposedAvatar(self.model, steps, self.controller)
 
 
 class ZeroMeanExposureMethod(RecipeMethod):
