@@ -111,6 +111,6 @@ def test_an_object_before_the_hand_is_left_out(
 ) -> None:
     """It costs the plain fit some 3.5 dB; 1.5 dB must come back."""
     training = with_an_object(make_training())
-    methods = PlainMethod(SETTINGS, 0), DelayedMaskMethod({**SETTINGS, "shape_from": 0.0}, 0)
+    methods = PlainMethod(SETTINGS, 0), DelayedMaskMethod(SETTINGS, 0)
     plain, ours = scores_of(training, make_painted("right"), *methods)
     assert ours > plain + 1.5, (plain, ours)

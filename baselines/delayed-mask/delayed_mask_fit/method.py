@@ -47,8 +47,9 @@ class DelayedMaskSettings(FitSettings):
     pull: float = number(0.5, 0.0, 1e6)
     #: Share of the fit in which the network learns from coarse images.
     coarse_until: float = number(2 / 3, 0.0, 1.0)
-    #: Share of the fit in which Gaussians keep their places, sizes and orientations.
-    shape_from: float = number(1 / 3, 0.0, 1.0)
+    #: Share of the fit in which Gaussians keep their places, sizes and orientations; 1/3 in the
+    #: schedule of RobustSplat, whose Gaussians do not grow in number before.
+    shape_from: float = number(0.0, 0.0, 1.0)
     #: By how much what is left out grows on all sides, px.
     margin: int = number(1, 0, 64)
     #: Adam step of the network; it does not fall.
