@@ -120,8 +120,9 @@ def best_start(
 ) -> dict[str, HandPose]:
     """Hands in the studio, where the light is as frames have shown it.
 
-    Of the rest pose and the fingers of those that are tried, in each turn, it is the one with most
-    skin to the camera that frames show well, less the skin that they do not.
+    Of the poses of fingers that are tried, or else at rest, in each turn, it is the one with most
+    skin to the camera that frames show well, less the skin that they do not. A clip says how a hand
+    looks in its own poses: at rest the insides of fingers that are always bent would be blotches.
     """
     studio, visibility, rigs = avatar.studio, avatar.model.visibility, avatar.model.rigs
     if visibility is None:
@@ -142,9 +143,9 @@ def best_start(
         for turn in _TURNS:
             yield {side: studio.posed(pose, turn)[side] for side, pose in poses.items()}
 
-    poses: list[dict[str, Pose]] = [dict.fromkeys(avatar.sides, REST)]
-    poses += [{side: hands[side].pose[1:] for side in avatar.sides} for hands in tried]
-    return max((hands for each in poses for hands in in_turns(each)), key=shown)
+    rest: dict[str, Pose] = dict.fromkeys(avatar.sides, REST)
+    of_clip = [{side: hands[side].pose[1:] for side in avatar.sides} for hands in tried]
+    return max((hands for poses in of_clip or [rest] for hands in in_turns(poses)), key=shown)
 
 
 def hand_controls(avatar: WildGHandAvatar, side: str) -> dict[str, Any]:
