@@ -30,8 +30,8 @@ from hwp_bench.leaderboard.suite_data import CaptureData, known_data, on_current
 from hwp_bench.methods.manifest import shipped_methods
 from hwp_bench.metrics import HWP_V1, PROTOCOLS, metric_names, penalty
 from hwp_bench.metrics.score import aggregate
-from hwp_bench.results.schema import MAX_BYTES, CaptureResult, score_rows
-from hwp_bench.suites.suite import find_missing, find_wrong_labels
+from hwp_bench.results.schema import MAX_BYTES, CaptureResult, TrainingData, score_rows
+from hwp_bench.suites.suite import find_missing, find_wrong_labels, suite_scenes
 from hwp_bench.taxonomy import SUITES as ALL_SUITES
 
 #: Suites whose captures are the same everywhere. `wild-dev` is for tuning.
@@ -131,6 +131,13 @@ def _check_one(entry: Entry) -> None:
             where=entry.name,
             field="suite",
             remedy=f"The leaderboard takes results of --suite {', '.join(SUITES)}.",
+        )
+    if shared := results.method.training.shared(suite_scenes(results.suite)):
+        raise UsageError(
+            f"is of a method that learnt from {', '.join(shared)}, on which it is scored",
+            where=entry.name,
+            field="method.training",
+            remedy="Train without the suite's scenes; `wild-dev` and your own scenes are free.",
         )
     if results.frames != "perturbed":
         raise UsageError(
@@ -299,6 +306,15 @@ def check_names(entries: Iterable[Entry], listed: frozenset[str]) -> None:
     """Refuse an entry under the name or title of a method that ships, unless it is listed."""
     for entry in entries:
         name = _taken(entry)
+        method = entry.results.method
+        declared = _declared().get(method.digest, method.training)
+        if declared != method.training:
+            raise UsageError(
+                f"says that the method learnt from {method.training.text}; its method.toml says "
+                f"{declared.text}",
+                where=entry.name,
+                field="method.training",
+            )
         if name is not None and entry.digest not in listed:
             raise UsageError(
                 f"carries the name of {name}, a method that ships with the toolkit",
@@ -307,6 +323,12 @@ def check_names(entries: Iterable[Entry], listed: frozenset[str]) -> None:
                 remedy="Give the method a name and title of its own in its method.toml. Rows of "
                 "methods that ship come from the maintainers (`hwp-bench leaderboard register`).",
             )
+
+
+@cache
+def _declared() -> dict[str, TrainingData]:
+    """What methods that ship declare that they learnt from, by their digests."""
+    return {manifest.digest: manifest.training for manifest in shipped_methods()}
 
 
 @cache
