@@ -173,8 +173,8 @@ def _warn_of_training(plan: Plan) -> None:
     scenes = {info.id: str(info.source.get("scene_digest") or info.origin) for info in infos}
     if shared := plan.manifest.training.shared(scenes):
         notice(
-            f"warning: {plan.manifest.name} declares that it learnt from {', '.join(shared)}, on "
-            "which it is scored now: the leaderboard refuses such results"
+            f"warning: {plan.manifest.name} declares that it was trained on {', '.join(shared)}, "
+            "on which it is scored now: the leaderboard refuses such results"
         )
 
 

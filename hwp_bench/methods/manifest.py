@@ -144,7 +144,7 @@ class ManifestFields:
     #: Short name: letters, digits, `.`, `_`, `-`.
     name: _MethodName
     entry: EntryPoint
-    #: What it learnt from before it sees a capture; `"none"` in the file where that is nothing.
+    #: What it was trained on before it sees a capture; `"none"` in the file where that is nothing.
     training: TrainingData
     #: Name in tables; the short name where the file does not say.
     title: Line = ""
@@ -335,10 +335,10 @@ def read_manifest(path: str | os.PathLike[str]) -> MethodManifest:
 
 
 def _training(value: Any, where: Path) -> Any:
-    """Return the table of what a method learnt from, empty for the word "none"."""
+    """Return the table of training data, empty for the word "none"."""
     if value in ({}, "") or (isinstance(value, str) and value != "none"):
         raise BadMethod(
-            "does not say what the method learnt from before it sees a capture",
+            "does not say what the method was trained on before it sees a capture",
             where=where,
             field="training",
             remedy='Write `training = "none"` where that is nothing, else a table [training] with '

@@ -139,7 +139,7 @@ def provenance(result: Results) -> dict[str, str]:
     return {
         "Method": f"{result.method.title} ({result.method.name}), preset {result.method.preset}",
         "Settings": ", ".join(f"{k} = {v}" for k, v in result.method.settings.items()) or "none",
-        "Learnt before from": result.method.training.text,
+        "Training data": result.method.training.text,
         "Suite, frames, seed": f"{result.suite}, {result.frames}, {result.seed}",
         "Budget": ", ".join(limits) or "none",
         "Started": result.started,

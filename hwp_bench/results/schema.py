@@ -171,9 +171,9 @@ class CaptureResult:
         return sum(frame.failure is not None for frame in self.frames)
 
 
-#: What a method can have learnt from before it sees a capture, in words for people.
+#: What a method can have been trained on before it sees a capture, in words for people.
 TRAINING_KINDS = {
-    "none": "nothing",
+    "none": "none",
     "simulated": "simulated people",
     "public": "public data sets",
     "private": "private data",
@@ -182,7 +182,7 @@ TRAINING_KINDS = {
 
 @dataclass(frozen=True)
 class TrainingData:
-    """What a method learnt from before it saw a capture; nothing where all three are empty."""
+    """What a method was trained on before it saw a capture: none where all three are empty."""
 
     #: Simulated people: by the name of a scene the digests of what was rendered (`Scene.digest`,
     #: in a capture's file `source.scene_digest`). People without a scene have a name of their own.
@@ -208,7 +208,7 @@ class TrainingData:
         return "; ".join(parts)
 
     def shared(self, scenes: Mapping[str, str]) -> list[str]:
-        """Return which of some scenes or clips, digests by name, it learnt from.
+        """Return which of some scenes or clips, digests by name, are among it.
 
         One is known by its name, whoever is seen in it, and by its digest under any name.
         """
@@ -231,7 +231,7 @@ class MethodId:
     preset: Line
     #: The settings that it was run with.
     settings: FreeTable
-    #: What it learnt from before, as its `method.toml` declares it.
+    #: What it was trained on before, as its `method.toml` declares it.
     training: TrainingData
 
     def __post_init__(self) -> None:
