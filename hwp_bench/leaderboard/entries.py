@@ -26,12 +26,6 @@ CHECK_SCHEMA = "hwp-leaderboard-check/1"
 CONTEST_SCHEMA = "hwp-leaderboard-contest/1"
 #: How far a row was checked, the least first.
 LEVELS = ("self-reported", "rescored", "re-run")
-#: What the levels mean, in words for people.
-LEVEL_TEXTS = {
-    "self-reported": "the submitter's own numbers; form and digests are sound",
-    "rescored": "every score was computed again from the stored predictions",
-    "re-run": "the method was run again, and its score came out the same",
-}
 #: What a reproducibility badge can say, and what it means.
 BADGES = {
     "not tried": "nobody has checked this row yet",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,6 +25,7 @@ from hwp_bench.leaderboard.board import (
     ranks_of,
     severities_of,
 )
+from hwp_bench.leaderboard.data_card import data_card
 from hwp_bench.leaderboard.entries import BADGES, Entry, digest
 from hwp_bench.leaderboard.gallery import write_extremes, write_gallery
 from hwp_bench.leaderboard.rules import HEADLINE, SUITES, check_entries, source_of, tables_of
@@ -218,6 +220,9 @@ def build_site(
         if scenes:
             files["gallery.js"] = f"var GALLERY = {canonical_json(scenes)};\n"
             files["viewer.js"] = script("viewer.js")
+        (temporary / "data").mkdir()
+        for suite in dict.fromkeys(row.suite for row in rows):
+            files[f"data/{suite}.json"] = json.dumps(data_card(suite), indent=1) + "\n"
         for name, text in files.items():
             (temporary / name).write_text(text, encoding="utf-8")
         for entry in entries:

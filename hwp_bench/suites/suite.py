@@ -24,6 +24,10 @@ class SuiteCapture(Protocol):
         """Id of the capture."""
 
     @property
+    def shows(self) -> str:
+        """What is seen, one line for people."""
+
+    @property
     def hands(self) -> str:
         """`right`, `left` or `both`."""
 
