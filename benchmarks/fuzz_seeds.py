@@ -100,7 +100,8 @@ def _write_submission(folder: Path) -> None:
     kept = next((folder / "results").rglob("predictions"))
     shutil.copytree(kept, made / "predictions" / "seed")
     (made / "method.toml").write_text(
-        'schema = "hwp-method/1"\ntraining = "none"\nname = "handed-in"\n[entry]\npredictions = "predictions"\n'
+        'schema = "hwp-method/1"\ntraining = "none"\n'
+        'name = "handed-in"\n[entry]\npredictions = "predictions"\n'
     )
 
 

@@ -240,7 +240,7 @@ def test_everything_is_reached_with_the_tab_key(browser) -> None:
     from selenium.webdriver.common.keys import Keys
 
     reached = []
-    for _ in range(24):
+    for _ in range(60):
         browser.switch_to.active_element.send_keys(Keys.TAB)
         active = browser.switch_to.active_element
         if active.tag_name == "body":
