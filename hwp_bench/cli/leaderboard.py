@@ -99,7 +99,7 @@ _CONTEST = """examples:
       --by maintainers --reason "it ran without its weights"
 
 RERUN is another run of the entry's method with the same settings, seed, budget and data. It is
-written whole into a file beside the entry, with both digests, and the row shows the lower score
+written whole into a file next to the entry, with both digests, and the row shows the lower score
 until one of the two is withdrawn: a withdrawn entry leaves the board, a withdrawn rerun counts no
 more. Both stay in the folder and on the method's page.
 """
@@ -118,7 +118,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     check = action("check", text, _check, _CHECK)
     show = action("show", "print the board: ranks with intervals, levels, badges", _show, _SHOW)
     confirm = action("confirm", "score an entry again, or compare a second run", _confirm, _CONFIRM)
-    text = "put a re-evaluation beside an entry, or withdraw one of them"
+    text = "put a re-evaluation next to an entry, or withdraw one of them"
     against = action("contest", text, _contest, _CONTEST)
     text = "allow entries the names of methods that ship"
     register = action("register", text, _register, _REGISTER)

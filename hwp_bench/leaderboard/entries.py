@@ -143,7 +143,7 @@ class Check:
 
 @dataclass(frozen=True)
 class Contest:
-    """A re-evaluation that somebody puts beside an entry, or the withdrawal of one of the two."""
+    """A re-evaluation that somebody puts next to an entry, or the withdrawal of one of the two."""
 
     #: Name of the entry, and the digest in its file.
     entry: Line
@@ -248,7 +248,7 @@ class Entry:
     digest: str = ""
     #: Its checks.
     checks: tuple[Check, ...] = ()
-    #: Re-evaluations that stand beside it, and withdrawals.
+    #: Re-evaluations that stand next to it, and withdrawals.
     contests: tuple[Contest, ...] = ()
 
     @property
@@ -260,6 +260,11 @@ class Entry:
     def badge(self) -> str:
         """Its reproducibility badge, one of `BADGES`."""
         return "contested" if self.open_contests else badge(self.checks)
+
+    @property
+    def additions(self) -> list[Check | Contest]:
+        """Its checks and contests."""
+        return [*self.checks, *self.contests]
 
     def withdrawal(self, kind: str, rerun: str | None = None) -> Contest | None:
         """Return what withdraws the entry, or one of the re-evaluations that contest it."""
@@ -392,11 +397,12 @@ def read_entries(folder: Path, on_fault: Callable[[HwpError], None] | None = Non
         entry_files(folder), lambda file: read_entry(file, checks, contests), on_fault
     )
     known = {(entry.name, entry.digest) for entry in entries}
-    for other in (*checks, *contests) if on_fault is None else ():
+    others: list[Check | Contest] = [*checks, *contests]
+    for other in others if on_fault is None else ():
         if (other.entry, other.entry_digest) not in known:
             raise BadResult(
                 f"is of {other.entry} with digest {other.entry_digest[:8]}, which is not there",
-                where=_file_beside(folder, other),
+                where=_file_next_to(folder, other),
                 field="entry",
             )
     return entries
@@ -445,7 +451,7 @@ def read_entry(file: Path, checks: Sequence[Check], contests: Sequence[Contest] 
     return Entry(file.stem, results, added, content, own, against)  # type: ignore[arg-type]
 
 
-def _file_beside(folder: Path, other: Check | Contest) -> Path:
+def _file_next_to(folder: Path, other: Check | Contest) -> Path:
     """Return the file of a check or contest: its entry, its kind, and part of its digest."""
     place = CHECKS if isinstance(other, Check) else CONTESTS
     return folder / place / f"{other.entry}.{other.kind}-{other.digest[:8]}.json"
@@ -459,7 +465,7 @@ def write_check(folder: Path, other: Check | Contest) -> Path:
         name, schema = "contest", CONTEST_SCHEMA
     value = {"schema": schema, "digest": other.digest, name: other.content}
     text = json.dumps(value, indent=None if name == "contest" else 1, allow_nan=False)
-    return atomic_write(_file_beside(folder, other), text + "\n")
+    return atomic_write(_file_next_to(folder, other), text + "\n")
 
 
 def _read_check(file: Path) -> Check:

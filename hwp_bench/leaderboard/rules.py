@@ -425,7 +425,7 @@ def check_contest(entry: Entry, contest: Contest) -> None:
     """Refuse a contest whose run is not of the entry or unsound, or a withdrawal of no contest."""
     if contest.results is None:
         if not any(other.results and other.rerun == contest.rerun for other in entry.contests):
-            problem = f"withdraws {contest.rerun[:8]}, which is no contest of the entry"
+            problem = f"withdraws {contest.rerun[:8]}, which does not contest the entry"
             raise _wrong(entry, "contests", problem)
         return
     if not repeats(entry.results, contest.results):
@@ -449,7 +449,7 @@ def check_dates(entry: Entry, now: datetime | None = None) -> None:
         started = started.replace(tzinfo=UTC)
     if started > latest:
         raise _wrong(entry, "started", f"is {entry.results.started}, which is not yet")
-    for check in (*entry.checks, *entry.contests):
+    for check in entry.additions:
         _check_date(entry, check, started, latest)
 
 
@@ -475,17 +475,16 @@ def _check_overruling(entry: Entry, check: Check) -> None:
 def without_false_checks(entry: Entry, now: datetime | None = None) -> Entry:
     """Return the entry without checks and contests that are false; each of them is said."""
     kept: list[Check | Contest] = []
-    for check in (*entry.checks, *entry.contests):
+    for check in entry.additions:
         try:
-            if isinstance(check, Check):
-                check_dates(replace(entry, checks=(check,), contests=()), now)
-            else:
+            if isinstance(check, Contest):
                 check_dates(replace(entry, checks=(), contests=(check,)), now)
-            if entry.protocol == HWP_V1.name and isinstance(check, Check):
-                _check_verdict(entry, check)
-                _check_overruling(entry, check)
-            elif isinstance(check, Contest):
                 check_contest(entry, check)
+            else:
+                check_dates(replace(entry, checks=(check,), contests=()), now)
+                if entry.protocol == HWP_V1.name:
+                    _check_verdict(entry, check)
+                    _check_overruling(entry, check)
         except HwpError as error:
             if error.field == "started":
                 raise

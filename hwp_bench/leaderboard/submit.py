@@ -285,7 +285,7 @@ def entry_of(entries: Sequence[Entry], results: Results, name: str | None) -> En
 def contest(
     entry: Entry, rerun: Path | str, *, by: str, reason: str, withdraws: str = ""
 ) -> Contest:
-    """Return what puts a re-evaluation beside an entry, or what withdraws one of the two.
+    """Return what puts a re-evaluation next to an entry, or what withdraws one of the two.
 
     Args:
         entry: the entry.

@@ -182,7 +182,7 @@ TRAINING_KINDS = {
 
 @dataclass(frozen=True)
 class TrainingData:
-    """What a method was trained on before it saw a capture: none where all three are empty."""
+    """The data that a method was trained on before it saw a capture; none where all is empty."""
 
     #: Simulated people: by the name of a scene the digests of what was rendered (`Scene.digest`,
     #: in a capture's file `source.scene_digest`). People without a scene have a name of their own.
@@ -202,7 +202,7 @@ class TrainingData:
 
     @property
     def text(self) -> str:
-        """What it is, in words for people: kinds and names."""
+        """Kinds and names, in words for people."""
         names = {name: ", ".join(getattr(self, name, ())) for name in self.kinds}
         parts = [TRAINING_KINDS[name] + (f" ({own})" if own else "") for name, own in names.items()]
         return "; ".join(parts)

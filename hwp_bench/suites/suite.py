@@ -25,7 +25,7 @@ class SuiteCapture(Protocol):
 
     @property
     def shows(self) -> str:
-        """What is seen, one line for people."""
+        """One line for people that says what it shows."""
 
     @property
     def hands(self) -> str:

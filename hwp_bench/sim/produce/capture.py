@@ -512,7 +512,7 @@ class SuiteItem:
 
     @property
     def shows(self) -> str:
-        """What is seen."""
+        """Title of the scene, one line for people."""
         return self.scene.title
 
     @property

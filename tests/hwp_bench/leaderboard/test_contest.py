@@ -99,7 +99,7 @@ def test_either_can_be_withdrawn(folder: Path, tmp_path: Path) -> None:
     assert call(folder, digest(run(26.0))[:8], "--withdraw", "rerun") == 0
     assert own(folder).badge == "not tried"
     assert len(list((folder / "contests").glob("*.json"))) == 4
-    # A withdrawn entry is no row; where another one of the method stands, that is the row.
+    # A withdrawn entry has no row; where another one of the method stands, that is the row.
     assert call(folder, digest(run(26.0))[:8], "--withdraw", "entry") == 0
     assert [row.title for row in method_rows(sound_entries(folder))] == ["Other"]
     write_entry(folder, make_entry(run(23.0, 3)))
@@ -169,6 +169,6 @@ def test_a_withdrawal_names_a_contest(folder: Path, tmp_path: Path) -> None:
         contest(entry, "0123abcd", by="B", reason="so", withdraws="rerun")
     made = contest(entry, tmp_path / "at20" / "results.json", by="B", reason="so")
     alone = replace(made, results=None, withdraws="entry")
-    with pytest.raises(BadResult, match="which is no contest of the entry"):
+    with pytest.raises(BadResult, match="which does not contest the entry"):
         check_bound(replace(entry, contests=(alone,)))
     check_bound(replace(entry, contests=(made, alone)))
