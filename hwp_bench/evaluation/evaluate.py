@@ -124,6 +124,7 @@ def run_plans(
             if evaluation.capture.lacks_masks:
                 name = evaluation.capture.info.id
                 notice(f"{name}: its true masks are not there: scored on its estimated masks")
+        _warn_of_training(next(iter(plans.values())))
         folders = {
             name: open_results_folder(
                 out / name,
@@ -164,6 +165,17 @@ def run_plans(
         results = {name: record(name) for name in plans}
         finish_together([(folders[name], results[name]) for name in plans], tables=tables)
         return results
+
+
+def _warn_of_training(plan: Plan) -> None:
+    """Say which captures a method learnt from before, as it declares itself."""
+    infos = [evaluation.capture.info for evaluation in plan.evaluations]
+    scenes = {info.id: str(info.source.get("scene_digest") or info.origin) for info in infos}
+    if shared := plan.manifest.training.shared(scenes):
+        notice(
+            f"warning: {plan.manifest.name} declares that it was trained on {', '.join(shared)}, "
+            "on which it is scored now: the leaderboard refuses such results"
+        )
 
 
 def with_setting_files(
@@ -210,7 +222,12 @@ class Plan:
         name, title, run = self.manifest.name, one_line(self.manifest.title), self.settings.run
         return Results(
             method=MethodId(
-                name, title, self.digest, self.settings.preset or DEFAULT_PRESET, dict(run.settings)
+                name,
+                title,
+                self.digest,
+                self.settings.preset or DEFAULT_PRESET,
+                dict(run.settings),
+                self.manifest.training,
             ),
             suite=self.settings.suite,
             seed=run.seed,

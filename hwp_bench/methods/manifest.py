@@ -26,6 +26,7 @@ from hwp_bench.base.records import (
 )
 from hwp_bench.methods.contents import digest_of, method_files
 from hwp_bench.methods.settings import class_settings
+from hwp_bench.results import TrainingData
 from hwp_bench.taxonomy import SIZED_LIKE
 
 #: Version of the method contract.
@@ -143,6 +144,8 @@ class ManifestFields:
     #: Short name: letters, digits, `.`, `_`, `-`.
     name: _MethodName
     entry: EntryPoint
+    #: What it was trained on before it sees a capture; `"none"` in the file where that is nothing.
+    training: TrainingData
     #: Name in tables; the short name where the file does not say.
     title: Line = ""
     description: Line = ""
@@ -303,6 +306,7 @@ def read_manifest(path: str | os.PathLike[str]) -> MethodManifest:
         fields["authors"] = ", ".join(authors)
     if isinstance(fields.get("settings"), str):
         fields["settings"] = [fields["settings"]]
+    fields["training"] = _training(fields.get("training", ""), where)
     for kind in ("switches", "bases"):
         found = fields.get(kind)
         if isinstance(found, dict) and all(isinstance(item, dict) for item in found.values()):
@@ -328,6 +332,19 @@ def read_manifest(path: str | os.PathLike[str]) -> MethodManifest:
         manifest.check_setting_names(values, place)
     _check_switches(manifest, where)
     return manifest
+
+
+def _training(value: Any, where: Path) -> Any:
+    """Return the table of training data, empty for the word "none"."""
+    if value in ({}, "") or (isinstance(value, str) and value != "none"):
+        raise BadMethod(
+            "does not say what the method was trained on before it sees a capture",
+            where=where,
+            field="training",
+            remedy='Write `training = "none"` where that is nothing, else a table [training] with '
+            "`simulated`, `public` or `private` (docs/methods.md).",
+        )
+    return {} if value == "none" else value
 
 
 def _check_switches(manifest: MethodManifest, where: Path) -> None:

@@ -180,7 +180,8 @@ class Method:
 """
     )
     (folder / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "count"\n[entry]\npython = "counting_method:Method"\n'
+        'schema = "hwp-method/1"\ntraining = "none"\n'
+        'name = "count"\n[entry]\npython = "counting_method:Method"\n'
         "[presets.default]\nlevel = 0.5\n"
     )
     return folder

@@ -27,6 +27,7 @@ from hwp_bench.methods.settings import check_source, source_path
 
 GOOD = """
 schema = "hwp-method/1"
+training = "none"
 name = "mine"
 title = "My method"
 [entry]
@@ -206,7 +207,8 @@ def test_faults_of_switches_are_named(tmp_path: Path, old: str, new: str, proble
 
 def test_a_wrong_setting_is_refused_by_the_list_of_the_method(tmp_path: Path) -> None:
     (tmp_path / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "listed"\nsettings = ["steps", "light.degree", "former"]\n'
+        'schema = "hwp-method/1"\ntraining = "none"\n'
+        'name = "listed"\nsettings = ["steps", "light.degree", "former"]\n'
         '[entry]\npython = "a:b"\n[presets.default]\nlight.degree = 2\n'
     )
     manifest = read_manifest(tmp_path)
@@ -225,7 +227,7 @@ def test_a_wrong_setting_is_refused_by_the_list_of_the_method(tmp_path: Path) ->
 
 
 def test_presets_and_switches_must_have_listed_settings(tmp_path: Path) -> None:
-    head = 'schema = "hwp-method/1"\nname = "listed"\nsettings = ["steps"]\n'
+    head = 'schema = "hwp-method/1"\ntraining = "none"\nname = "listed"\nsettings = ["steps"]\n'
     entry = '[entry]\npython = "a:b"\n'
     for table, field in (
         ("[presets.quick]\nstep = 3\n", "presets.quick"),
@@ -254,6 +256,7 @@ def test_settings_may_be_a_class(tmp_path: Path) -> None:
 
 
 MANIFEST = """schema = "hwp-method/1"
+training = "none"
 name = "listed"
 settings = ["steps", "net.regions"]
 files = { "net.regions" = ["sam"] }
