@@ -91,13 +91,11 @@ def sample_poses(
         clip = {side: start[side].pose[None] for side in avatar.sides}
     else:
         _check(avatar, capture)
-        fitted = [frame for frame in avatar.record.frames if _shown(avatar, capture, frame)]
-        if not fitted:
-            raise UsageError("has no fitted frame that shows every hand", where=capture.root)
+        fitted = _fitted(avatar, capture)
         frames = [fitted[pick] for pick in evenly(len(fitted), settings.most_frames)]
         drawn = [fitted[pick] for pick in evenly(len(fitted), settings.clip_samples)]
         poses = {f: avatar.believed(capture.hand_poses(f)) for f in fitted}
-        start = best_start(avatar, [poses[fitted[k]] for k in evenly(len(fitted), _TRIED)])
+        start = start_of_clip(avatar, capture)
         clip = {
             side: np.stack([start[side].pose, *(poses[frame][side].pose for frame in drawn)])
             for side in avatar.sides
@@ -144,8 +142,17 @@ def best_start(
             yield {side: studio.posed(pose, turn)[side] for side, pose in poses.items()}
 
     rest: dict[str, Pose] = dict.fromkeys(avatar.sides, REST)
-    of_clip = [{side: hands[side].pose[1:] for side in avatar.sides} for hands in tried]
+    of_clip: list[dict[str, Pose]] = [
+        {side: hands[side].pose[1:] for side in avatar.sides} for hands in tried
+    ]
     return max((hands for poses in of_clip or [rest] for hands in in_turns(poses)), key=shown)
+
+
+def start_of_clip(avatar: WildGHandAvatar, capture: Capture) -> dict[str, HandPose]:
+    """Hands in the studio in the pose of the clip that `best_start` finds."""
+    fitted = _fitted(avatar, capture)
+    tried = [fitted[pick] for pick in evenly(len(fitted), _TRIED)]
+    return best_start(avatar, [avatar.believed(capture.hand_poses(frame)) for frame in tried])
 
 
 def hand_controls(avatar: WildGHandAvatar, side: str) -> dict[str, Any]:
@@ -183,8 +190,13 @@ def _check(avatar: WildGHandAvatar, capture: Capture) -> None:
         )
 
 
-def _shown(avatar: WildGHandAvatar, capture: Capture, frame: int) -> bool:
-    return all(bool(capture.hands[side].valid[frame]) for side in avatar.sides)
+def _fitted(avatar: WildGHandAvatar, capture: Capture) -> list[int]:
+    """The fitted frames that show every hand of the avatar."""
+    valid = [capture.hands[side].valid for side in avatar.sides]
+    found = [frame for frame in avatar.record.frames if all(one[frame] for one in valid)]
+    if not found:
+        raise UsageError("has no fitted frame that shows every hand", where=capture.root)
+    return found
 
 
 # Field of view of the still image, and how much of it the hand fills.
