@@ -18,7 +18,7 @@ from hwp_bench.base.errors import BadMethod, HwpError, UsageError, one_line
 from hwp_bench.base.files import Places, canonical_json, check_places, inside
 from hwp_bench.base.folders import exclusive
 from hwp_bench.base.packages import __version__
-from hwp_bench.base.records import MAX_COUNT, check_json_values, merged, parse_record
+from hwp_bench.base.records import check_json_values, merged, parse_record
 from hwp_bench.capture import Capture
 from hwp_bench.capture.splits import Split, split_for
 from hwp_bench.commitments.publication import open_captures
@@ -77,9 +77,10 @@ def make_budget(seconds: float | None, steps: int | None) -> Budget:
     They stand next to more steps than a fit takes in that time, 1,000 a second and at least
     100,000, so that a result says what it was made with.
     """
-    if seconds is not None and steps is None:
-        steps = min(max(_LIFTED, math.ceil(1_000 * seconds)), MAX_COUNT)
-    return Budget(seconds, steps)
+    asked = Budget(seconds, steps)
+    if asked.seconds is None or asked.steps is not None:
+        return asked
+    return replace(asked, steps=max(_LIFTED, math.ceil(1_000 * asked.seconds)))
 
 
 def default_folder(method: str, settings: EvaluationSettings) -> Path:
