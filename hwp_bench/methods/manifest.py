@@ -62,13 +62,12 @@ _SettingsItem = Annotated[
     ),
 ]
 _KindName = Annotated[str, _matching(r"[a-z][a-z0-9-]{0,31}", "a word of letters and digits")]
-#: What a method may use validation frames for, besides the curve that the benchmark draws.
+#: What a method may choose by validation frames; it learns from training frames alone.
 VALIDATION_USES: Mapping[str, str] = {
     "earlier-state": "the fit ends with an earlier state where that draws them better",
     "settings": "single settings are chosen for the capture",
     "shape": "how far the hand's shape is fitted is chosen",
-    "clean-frames": "training frames are judged by what these, which are clean, look like",
-    "fit": "they are fitted as training frames are",
+    "clean-frames": "training frames are judged by how these, which are clean, look",
 }
 _ValidationUse = Annotated[
     str, _matching("|".join(VALIDATION_USES), f"one of {', '.join(VALIDATION_USES)}")

@@ -146,8 +146,8 @@ class Drawing:
 class Recipe(IterativeFit[Avatar], Generic[Settings]):
     """A fit with its hooks. The plain fit is one; a method with a model of its own is another.
 
-    Each step calls `draw`, `weights`, `loss` and, after Adam's step, `move_back`. What is no
-    method's idea is here: the mean of the last steps, and the choice of an earlier state by
+    Each step calls `draw`, `weights`, `loss` and, after Adam's step, `move_back`. What any
+    method can have is here: the mean of the last steps, and the choice of an earlier state by
     validation frames (`wildghand.plain.choice`).
     Hooks keep what they need as attributes; tensors that Adam fits are named by `parameters`.
 

@@ -27,7 +27,7 @@ def words(make_capture: CaptureMaker, tmp_path: Path, monkeypatch: pytest.Monkey
     text = bare.read_text().replace('"toy"', '"bare"').replace('"Toy"', '"Bare"')
     bare.write_text(text.replace("tone = true", "tone = false"))
     toy = write_toy_method(tmp_path / "toy") / "method.toml"
-    toy.write_text('validation = ["shape", "fit"]\n' + toy.read_text())
+    toy.write_text('validation = ["shape", "settings"]\n' + toy.read_text())
     capture = make_capture(frames=20).root
     # The toy notes its fits next to its folder.
     return ["evaluate", "toy", "bare", "--capture", str(capture), "--isolation", "none"]
@@ -45,7 +45,7 @@ def test_each_method_and_seed_has_a_folder_and_one_table_compares_them(
     assert "Toy, seed 0, 1 of 4" in told.err
     assert "Bare, seed 1, 4 of 4" in told.err
     assert told.out.count("Ranks by") == 1
-    assert "Toy: shape, fit; Bare: not declared" in told.out.replace("\n", " ")
+    assert "Toy: shape, settings; Bare: not declared" in told.out.replace("\n", " ")
     folders = [f"{method}/seed-{seed}" for method in ("bare", "toy") for seed in (0, 1)]
     found = sorted(file.parent.relative_to("field") for file in Path("field").rglob("results.json"))
     assert [str(folder) for folder in found] == folders
@@ -56,7 +56,7 @@ def test_each_method_and_seed_has_a_folder_and_one_table_compares_them(
     alone, several = read_results("alone"), read_results("field/toy/seed-1")
     assert alone.captures[0].key == several.captures[0].key
     assert alone.captures[0].frames == several.captures[0].frames
-    assert alone.method.validation == ["shape", "fit"]
+    assert alone.method.validation == ["shape", "settings"]
     capsys.readouterr()
     for command in (["table", "field", "--by", "seeds"], ["compare", "field"]):
         assert main(command) == 0

@@ -62,7 +62,7 @@ def test_a_manifest_is_read(tmp_path: Path) -> None:
 
 def test_uses_of_validation_frames_are_declared_or_not(tmp_path: Path) -> None:
     assert read_manifest(_write(tmp_path, GOOD)).validation is None
-    for uses in ([], ["fit"], list(VALIDATION_USES)):
+    for uses in ([], ["shape"], list(VALIDATION_USES)):
         text = GOOD.replace("[entry]", f"validation = {uses}\n[entry]")
         assert read_manifest(_write(tmp_path, text)).validation == uses
 
