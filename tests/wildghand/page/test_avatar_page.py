@@ -33,7 +33,7 @@ from wildghand.fitting.fit import StepBatch
 from wildghand.model.settings import read_settings
 from wildghand.page import write_page
 from wildghand.page.bake import pack_correctives
-from wildghand.page.write import PageSettings, best_turn, mean_weights, sample_poses
+from wildghand.page.write import PageSettings, best_start, mean_weights, sample_poses
 from wildghand.splat import rasterize
 from wildghand.visibility import ColorChanges
 
@@ -247,20 +247,26 @@ def test_pose_correctives_are_those_of_the_hand_model(opened) -> None:
     np.testing.assert_allclose(made, truth, atol=0.02 * np.abs(truth).max())
 
 
-def test_a_page_opens_on_the_side_that_frames_show(fitted) -> None:
-    avatar, _ = fitted
-    turn = best_turn(avatar)
-    camera = avatar.studio.camera(32, 32)
+def test_a_page_opens_on_skin_that_frames_show(fitted) -> None:
+    avatar, capture = fitted
+    camera = avatar.studio.camera(64, 64)
     marked = copy.deepcopy(avatar)
     # Skin that frames show is white, other skin black.
     kept = marked.model.visibility.offsets["right"][:, None]
-    logits = torch.where(kept > kept.median(), 9.0, -9.0).expand(-1, 3)
-    marked.model.keep(ColorChanges({"right": logits}))
-    shown = [
-        marked.render(marked.studio.posed("rest", angle), camera)[..., :3].mean()
-        for angle in (turn, turn + 180)
-    ]
-    assert shown[0] > shown[1]
+    marked.model.keep(ColorChanges({"right": (40.0 * (kept - 0.5)).clamp(-9, 9).expand(-1, 3)}))
+
+    def white_less_black(hands) -> float:
+        drawn = marked.render(hands, camera)
+        return float((2.0 * drawn[..., 0] - drawn[..., 3]).sum())
+
+    tried = [avatar.believed(capture.hand_poses(frame)) for frame in avatar.record.frames]
+    found = {name: best_start(avatar, poses) for name, poses in (("rest", ()), ("clip", tried))}
+    sides = [white_less_black(avatar.studio.posed("rest", turn)) for turn in range(0, 360, 45)]
+    # The page judges anchors and not pixels.
+    assert white_less_black(found["rest"]) > 0.9 * max(sides) > 0.0
+    assert white_less_black(found["clip"]) > 0.9 * white_less_black(found["rest"])
+    fingers = found["clip"]["right"].pose[1:]
+    assert any(np.allclose(fingers, hands["right"].pose[1:]) for hands in tried)
 
 
 def test_skin_that_no_frame_shows_is_marked(opened) -> None:
