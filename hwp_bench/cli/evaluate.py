@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from hwp_bench.base.console import JobsView, notice
-from hwp_bench.base.errors import UsageError
+from hwp_bench.base.errors import BadMethod, MethodFailed, UsageError
 from hwp_bench.base.tables import Column, Table, print_table, to_object, write_tables
 from hwp_bench.cli.options import (
     SEVERAL,
@@ -147,7 +147,6 @@ def _evaluate_several(
     args: argparse.Namespace, settings: EvaluationSettings, sealed: SealedPart | None
 ) -> int:
     """Evaluate several methods and seeds, seed by seed, and compare them in one table."""
-    from hwp_bench.base.errors import BadMethod, MethodFailed
     from hwp_bench.evaluation.evaluate import default_folder, evaluate
     from hwp_bench.methods.manifest import find_method, read_manifest
     from hwp_bench.report.requested_table import TableRequest, make_table
@@ -180,13 +179,12 @@ def _evaluate_several(
                 continue
             status |= _notice_failures(folder, results, head)
             done += [folder] if results.drawn else []
-    if not done:
-        return status
-    table = make_table(TableRequest(done, "rank" if len(manifests) > 1 else "seeds"))
+    by = "rank" if len(manifests) > 1 else "seeds"
+    table = make_table(TableRequest(done, by)) if done else None
     if args.json:
         files = [str(folder / "results.json") for folder in done]
-        print_json({"results": files, "table": to_object(table)})
-    else:
+        print_json({"results": files, "table": table and to_object(table)})
+    elif table is not None:
         print_table(table)
     notice(f"results: {out}; more tables: hwp-bench table {out} --by NAME")
     return status

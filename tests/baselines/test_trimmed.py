@@ -213,12 +213,15 @@ def vote() -> dict[str, Any]:
 
 
 def with_an_object(training: TrainingCapture) -> TrainingCapture:
-    """Put a green board before the palm in two of five training frames; the masks keep it."""
-    read = training.frame
+    """Put a green board before the palm in two of five training frames; the masks keep it.
+
+    Validation frames stay clean, as they are in the data set: they choose the state that is kept.
+    """
+    read, shown = training.frame, set(training.train.tolist())
 
     def frame(index: int) -> np.ndarray:
         image = read(index).copy()
-        if index % 5 < 2:
+        if index in shown and index % 5 < 2:
             rows, columns = np.nonzero(training.mask(index) > 127)
             top, middle = int(np.quantile(rows, 0.35)), int(np.quantile(columns, 0.5))
             image[top : top + 18, middle - 10 : middle + 10] = (20, 200, 60)
