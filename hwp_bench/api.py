@@ -71,8 +71,8 @@ def evaluate(
         preset: preset of the method; the suite's, else `default`, if None.
         settings: settings that override the preset, such as `{"dpd.enabled": False}`.
         seed: seed of everything random.
-        seconds: limit of the fit on the method's clock, s; without `steps` the preset's number of
-            steps is no limit then.
+        seconds: limit of the fit on the method's clock, s; without `steps` it lifts the preset's
+            limit of steps.
         steps: limit of the fit in optimizer steps.
         frames: training frames that the method is given: `perturbed`, or an oracle's (`clean`,
             `unperturbed-only`).
