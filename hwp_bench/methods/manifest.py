@@ -63,6 +63,16 @@ _SettingsItem = Annotated[
     ),
 ]
 _KindName = Annotated[str, _matching(r"[a-z][a-z0-9-]{0,31}", "a word of letters and digits")]
+#: What a method may choose by validation frames; it learns from training frames alone.
+VALIDATION_USES: Mapping[str, str] = {
+    "earlier-state": "the fit ends with an earlier state where that draws them better",
+    "settings": "single settings are chosen for the capture",
+    "shape": "how far the hand's shape is fitted is chosen",
+    "clean-frames": "training frames are judged by how these, which are clean, look",
+}
+_ValidationUse = Annotated[
+    str, _matching("|".join(VALIDATION_USES), f"one of {', '.join(VALIDATION_USES)}")
+]
 _SwitchSettings = Annotated[
     dict[_SettingName, Any], Meta(min_length=1, description="a table of at least one setting")
 ]
@@ -153,6 +163,9 @@ class ManifestFields:
     authors: Line = ""
     licence: Line = ""
     url: Line = ""
+    #: What it uses validation frames for, at most: words of `VALIDATION_USES`, empty for nothing;
+    #: None where the file does not say.
+    validation: Annotated[list[_ValidationUse], Meta(max_length=10)] | None = None
     #: Names of its settings, dotted within tables. A name stands for everything below it, and
     #: `module:Class` for the fields of a dataclass.
     settings: list[_SettingsItem] = field(default_factory=list)

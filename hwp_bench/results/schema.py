@@ -233,6 +233,9 @@ class MethodId:
     settings: FreeTable
     #: What it was trained on before, as its `method.toml` declares it.
     training: TrainingData
+    #: What it declares to use validation frames for; None where it does not say, and where it was
+    #: not recorded.
+    validation: Annotated[list[Line], Meta(max_length=10)] | None = None
 
     def __post_init__(self) -> None:
         check_table(self.settings, "settings")
@@ -415,6 +418,22 @@ def add_isolation_note(table: Table, results: Sequence[Results]) -> Table:
     """Return a table with `isolation_note` below it, once."""
     note = isolation_note(results)
     return table if note in ("", *table.notes) else replace(table, notes=(*table.notes, note))
+
+
+# --- what validation frames are used for
+
+
+def add_validation_note(table: Table, results: Sequence[Results]) -> Table:
+    """Return a table with a line below it of what each method uses validation frames for."""
+    titles: dict[str, dict[str, None]] = {}
+    for one in results:
+        uses = one.method.validation
+        text = "not declared" if uses is None else ", ".join(uses) or "nothing"
+        titles.setdefault(text, {})[one.method.title] = None
+    if titles.keys() <= {"not declared"}:
+        return table
+    told = "; ".join(f"{', '.join(names)}: {text}" for text, names in titles.items())
+    return replace(table, notes=(*table.notes, f"Declared uses of validation frames: {told}."))
 
 
 # --- the environment of a result

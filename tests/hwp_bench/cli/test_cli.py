@@ -110,7 +110,9 @@ def test_lists_speak_json(capsys) -> None:
     suites += [f"persistent-clean{percent}" for percent in (0, 20, 35, 60)]
     suites.append("real-1")
     assert [row["suite"] for row in value["suites"]] == suites
-    assert "plain" in [row["method"] for row in value["methods"]]
+    uses = {row["method"]: row["validation frames"] for row in value["methods"]}
+    assert uses["plain"] == "earlier-state"
+    assert uses["wildghand"] == "earlier-state, settings, shape, clean-frames"
 
 
 def test_evaluate_prints_the_table_and_says_where_things_are(

@@ -16,6 +16,7 @@ from hwp_bench.evaluation.capture_evaluation import EvaluationSettings
 from hwp_bench.evaluation.evaluate import with_setting_files
 from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.manifest import (
+    VALIDATION_USES,
     MethodManifest,
     check_settings,
     find_method,
@@ -60,6 +61,13 @@ def test_a_manifest_is_read(tmp_path: Path) -> None:
         manifest.preset("fast")
 
 
+def test_uses_of_validation_frames_are_declared_or_not(tmp_path: Path) -> None:
+    assert read_manifest(_write(tmp_path, GOOD)).validation is None
+    for uses in ([], ["shape"], list(VALIDATION_USES)):
+        text = GOOD.replace("[entry]", f"validation = {uses}\n[entry]")
+        assert read_manifest(_write(tmp_path, text)).validation == uses
+
+
 def test_authors_terms_and_page_are_kept(tmp_path: Path) -> None:
     plain = read_manifest(_write(tmp_path, GOOD))
     assert (plain.authors, plain.licence, plain.url) == ("", "", "")
@@ -86,6 +94,11 @@ def test_authors_terms_and_page_are_kept(tmp_path: Path) -> None:
             'title = "My method"',
             f'title = "{"x" * 2000}"',
             "xxx', expected one line of at most 1,000",
+        ),
+        (
+            "[entry]",
+            'validation = ["stopping"]\n[entry]',
+            "validation[0]: is 'stopping', expected one of earlier-state, settings, shape",
         ),
         ("title", "titel", "titel: is not known. Did you mean 'title'?"),
         (
