@@ -1,6 +1,6 @@
 """How often the 95 % interval covers the truth, by simulation.
 
-`python -m benchmarks.coverage` prints the table of `docs/statistics.md`.
+`python -m benchmarks.coverage` prints the table of `docs/studies/bootstrap-coverage.md`.
 """
 
 from __future__ import annotations

@@ -60,7 +60,7 @@ def validation_score(
     with tempfile.TemporaryDirectory() as place:
         run = RunSettings(settings, seed, budget)
         training = open_request(write_request(Path(place) / "request", opened, split, run))
-        entry = load_entry(folder, str(read_manifest(folder).entry))
+        entry = load_entry(folder, str(read_manifest(folder).entry.python))
         avatar = entry(training.run.settings, seed).fit(training, budget, _Quiet())
         frames = split.validation.tolist()
         made = [Prediction(frame, render(avatar, training, frame), None) for frame in frames]

@@ -1,8 +1,8 @@
 """The wild suites for people: what each capture is, what sets share, and contact sheets.
 
-Run from the repository: `python -m benchmarks.wild wild-dev` prints the tables of docs/wild.md;
-`--picture FILE` also draws some frames of every capture of the suite, a row each, and renders
-captures that are not in the cache.
+Run from the repository: `python -m benchmarks.wild wild-dev` prints a table of the captures and one
+of the parts that sets share (docs/wild.md); `--picture FILE` also draws some frames of every
+capture of the suite, a row each, and renders captures that are not in the cache.
 """
 
 from __future__ import annotations

@@ -65,6 +65,15 @@ def test_fields_of_records_are_documented(site: Path) -> None:
     assert "Optimizer steps; None keeps the method" in page
 
 
+def test_the_fields_of_scene_files_are_listed(site: Path) -> None:
+    page = (site / "api" / "scenes.html").read_text(encoding="utf-8")
+    cells = [re.sub("<[^>]+>", "", cell) for cell in re.findall(r"<td>(.*?)</td>", page, re.DOTALL)]
+    row = cells.index("sharpening")
+    assert cells[row + 1 : row + 3] == ["0.0", "0 to 3"]
+    assert cells[cells.index("frame_count") + 1] == "required"
+    assert all(cells[3::4]), "every field has a meaning"
+
+
 def test_no_page_loads_anything_from_elsewhere(site: Path) -> None:
     pages = list(site.rglob("*.html"))
     assert len(pages) > 25

@@ -1,16 +1,19 @@
 """Builds the documentation site: `mkdocs build --strict` reads `mkdocs.yml`, which loads this.
 
 It adds pages that are not files below `docs/` (the README as home, the files at the root that
-contributors read, the page of each baseline, one page of API reference for each public package),
-and gives the reference the `#:` comments that document fields and constants.
+contributors read, the page of each baseline, one page of API reference for each public package, and
+one of the tables of scene files), and gives the reference the `#:` comments that document fields
+and constants.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
+import inspect
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from griffe import Attribute, Docstring, Extension
 from mkdocs.config.defaults import MkDocsConfig
@@ -36,6 +39,35 @@ API = (
     "wildghand",
     "wildghand.splat",
 )
+#: The records behind a scene file: the heading of a table, and its class in `hwp_bench.sim`.
+SCENE_TABLES = {
+    "top": "scene.scene.Scene",
+    "camera": "scene.scene.SceneCamera",
+    "track": "scene.scene.Track",
+    "keys of hands": "scene.scene.HandKey",
+    "estimator": "scene.scene.Estimator",
+    "subject": "subject.subject.Subject",
+    "subject.anatomy": "hand.anatomy.SubjectAnatomy",
+    "subject.looks": "subject.subject.Looks",
+    "tattoos": "subject.wear.Tattoo",
+    "polish": "subject.wear.Polish",
+    "rings": "subject.wear.Ring",
+    "wrist": "subject.wear.WristWear",
+    "gloves": "subject.wear.Glove",
+    "light": "light.lights.Light",
+    "light.lamps": "light.lights.Lamp",
+    "light.room": "light.lights.Room",
+    "sensor": "sensor.Sensor",
+    "sensor.auto": "sensor.AutoControl",
+    "behind.clutter": "props.behind.Clutter",
+    "behind.face": "props.behind.Face",
+    "behind.arm": "props.behind.OtherArm",
+    "effects: hand_object_interaction": "effects.ObjectInteraction",
+    "items of hand_object_interaction": "effects.ObjectItem",
+    "effects: complex_poses": "effects.ComplexPoses",
+    "effects: illumination": "effects.Illumination",
+    "effects: motion_blur": "effects.MotionBlur",
+}
 
 _LINK = re.compile(r"\]\((?!https?://|#)([^)\s#]+)((?:#[^)\s]*)?)\)")
 
@@ -55,7 +87,57 @@ def on_files(files: Files, *, config: MkDocsConfig) -> Files:
         options = f"    options:\n      members: {public}\n" if public else ""
         text = f"# `{package}`\n\n::: {package}\n{options}"
         files.append(File.generated(config, f"api/{package}.md", content=text))
+    files.append(File.generated(config, "api/scenes.md", content=_scene_page()))
     return files
+
+
+def _scene_page() -> str:
+    """The reference of scene files: every field with its default, range and meaning."""
+    parts = ["# Scene files", "", "The fields of [a scene](../simulation.md#a-scene), by table."]
+    for title, name in SCENE_TABLES.items():
+        module, _, record = name.rpartition(".")
+        kind = getattr(importlib.import_module(f"hwp_bench.sim.{module}"), record)
+        parts += [
+            "",
+            f"## {title}",
+            "",
+            "| field | default | range | meaning |",
+            "| - | - | - | - |",
+        ]
+        parts += _field_rows(kind)
+    return "\n".join(parts) + "\n"
+
+
+def _field_rows(record: type) -> list[str]:
+    source = re.findall(r"((?:^    #: .*\n)+)    (\w+):", inspect.getsource(record), re.MULTILINE)
+    meanings = {name: " ".join(comment.replace("#:", "").split()) for comment, name in source}
+    hints = get_type_hints(record, include_extras=True)
+    rows = []
+    for field in dataclasses.fields(record):
+        default = field.default
+        if default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
+            shown = "required"
+        else:
+            # Tables and lists have a heading of their own.
+            plain = isinstance(default, str | int | float | tuple) and default != ()
+            shown = f"`{default}`" if plain else ""
+        meaning = meanings.get(field.name, "").replace("|", "\\|")
+        rows.append(f"| `{field.name}` | {shown} | {_range(field, hints)} | {meaning} |")
+    return rows
+
+
+def _range(field: dataclasses.Field[Any], hints: dict[str, Any]) -> str:
+    if field.metadata.get("range"):
+        return "{:g} to {:g}".format(*field.metadata["range"])
+    hint = hints[field.name]
+    for part in (hint, *get_args(hint)):
+        if get_origin(part) is Literal:
+            return ", ".join(f"`{word}`" for word in get_args(part))
+        bounds = [meta for meta in getattr(part, "__metadata__", ()) if hasattr(meta, "ge")]
+        if bounds and bounds[0].le is not None:
+            low, high = bounds[0].ge, bounds[0].le
+            return f"{low:g} to {high:g}" if high < 1e9 else f"from {low:g}"
+    return ""
 
 
 def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: Files) -> str:

@@ -13,6 +13,9 @@ OccluderMethod  # the entry of baselines/occluder-splats/method.toml
 ScanMethod  # the entry of baselines/scan-texture/method.toml
 SpaceMethod  # the entry of baselines/texture-space/method.toml
 ShadowMethod  # the entry of baselines/shadow-albedo/method.toml
+ComplementaryMasksMethod  # the entry of baselines/complementary-masks/method.toml
+DelayedMaskMethod  # the entry of baselines/delayed-mask/method.toml
+ZeroMeanExposureMethod  # the entry of baselines/zero-mean-exposure/method.toml
 write_splits  # writes what `read_splits` reads; benchmarks and organizers call it
 OneShotMethod  # the entry of baselines/one-shot-prior/method.toml
 _.ambient_rate  # `Recipe.rates` reads it by the tensor's name

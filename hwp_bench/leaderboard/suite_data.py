@@ -172,7 +172,7 @@ def joined_data(
 ) -> SuiteData:
     """Return all captures of both, as rendered where a capture is in both.
 
-    With the name of a processor, what it renders otherwise stands beside what is known.
+    With the name of a processor, what it renders otherwise is added to what is known.
     """
     kept = known.suites
     if known.renderer != rendered.renderer:

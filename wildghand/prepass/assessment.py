@@ -39,7 +39,8 @@ CLEAN_SHARE = 0.35
 #: Fewer clean frames than this do not show a hand: the least perturbed ones stand for them.
 LEAST_CLEAN = 3
 #: The cue that tells each perturbation, and how many of its deviations make one level: about
-#: what they are on simulated captures, where the levels are known (docs/prepass.md).
+#: what they are on simulated captures, where the levels are known
+#: (docs/studies/prepass.md).
 CUES: Mapping[str, tuple[str, float]] = MappingProxyType(
     {
         "hand_object_interaction": ("hidden_deviation", 1.0),
@@ -70,7 +71,7 @@ class FrameAssessment:
     #: (R,) weight of the frame in the fit, from the floor to 1.
     frame_weights: np.ndarray
     #: (R,) chance that omega is dropped in training: 1 where the frame is judged clean, else 0.
-    #: What little biases took from clean frames, the avatar lacked (docs/wildghand.md).
+    #: What little biases took from clean frames, the avatar lacked (docs/dpd_pao.md).
     omega_dropout: np.ndarray
     #: (R,) bool: sharp frames whose mask says that the hand is elsewhere.
     refine_pose: np.ndarray

@@ -11,7 +11,8 @@ from wildghand.prepass.assessment import CLEAN_FROM, CLEAN_SHARE, normal_value
 from wildghand.prepass.measurements import FrameMeasurements
 
 #: Distance of a pixel's tint from the skin's, in those of the clean frames at the same place, at
-#: which its weight has halved. Half of it takes more away than it saves (docs/prepass.md).
+#: which its weight has halved. Half of it takes more away than it saves
+#: (docs/studies/prepass.md).
 TINT_SCALE = 4.0
 #: Factor on both scales in a frame that is surely clean. Little can cover the hand there, and what
 #: looks odd (nails, rings, seams of a glove a little off their place) belongs to it.
