@@ -26,7 +26,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class ItemStatistics:
-    """What one capture says of methods in one metric; None where it cannot be told."""
+    """How one capture tells methods apart in one metric; None where it cannot be told."""
 
     #: Id of the capture.
     capture: str
