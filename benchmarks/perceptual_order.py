@@ -1,4 +1,4 @@
-"""How the oriented distance orders known degradations, next to PSNR, SSIM and, if here, LPIPS.
+"""How the oriented distance orders known degradations, next to PSNR, SSIM, FLIP and LPIPS.
 
 Run from the repository: `python -m benchmarks.perceptual_order [--picture FILE.png]`.
 The images are three photographs that scikit-image contains, seen through a disc as a hand is
@@ -26,7 +26,7 @@ SIZE, RADIUS = 256, 90
 #: PSNR, dB, at which the kinds are compared with each other.
 EQUAL_PSNR = 28.0
 #: Metrics that are printed where they are there.
-SHOWN = ("psnr", "ssim", "oriented_distance", "lpips_alex", "lpips_vgg")
+SHOWN = ("psnr", "ssim", "oriented_distance", "flip", "lpips_alex", "lpips_vgg")
 
 
 def shift(image: np.ndarray, pixels: float) -> np.ndarray:

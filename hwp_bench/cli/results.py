@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 _TABLES = (
     *("overall", "rank", "cost", "captures", "perturbations", "details", "micro", "paper"),
     *("robustness", "severity", "clean-share", "novelty", "outline", "free-view", "bias", "seeds"),
+    "discrimination",
 )
 _TABLE = """examples:
   hwp-bench table runs/plain-mini
@@ -38,6 +39,7 @@ _TABLE = """examples:
   hwp-bench table runs/* --by overall --format tex > table.tex
   hwp-bench table runs/mine-mini runs/mine-mini-clean runs/plain-mini --by robustness --base plain
   hwp-bench table runs/mine-seed* --by seeds
+  hwp-bench table runs/* --by discrimination    # which captures and metrics tell methods apart
   hwp-bench table runs/mine-persistent* runs/plain-persistent* --by clean-share --figure runs
   hwp-bench table runs/plain-mini runs/mine-mini --by novelty   # where training showed little
   hwp-bench table runs/plain-mini runs/mine-mini --by outline   # what is drawn outside of the hand
@@ -63,7 +65,11 @@ def _add_table(parser: argparse.ArgumentParser) -> None:
         "append the paper's own numbers, marked as published on other data",
     )
     add("--published", action="store_true", help=text)
-    add("--base", metavar="NAME", help="robustness: method that the gap is counted from")
+    add(
+        "--base",
+        metavar="NAME",
+        help="robustness: method that the gap is counted from; discrimination: the ceiling",
+    )
     add_capture_folders(parser, "severities, clean shares, novelty and outlines")
     forms = ("terminal", "md", "tex", "csv", "json")
     text = "format of the table (default terminal)"

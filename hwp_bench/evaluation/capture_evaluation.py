@@ -78,7 +78,7 @@ class CaptureEvaluation:
     split: Split
     #: How it is evaluated, with all settings of the method.
     settings: EvaluationSettings
-    #: LPIPS by backbone, where the weights are there.
+    #: LPIPS by backbone, where the weights are there, and FLIP.
     networks: Mapping[str, Network] = field(default_factory=dict)
     #: Digests of the method's files when the evaluation was planned; None takes them as they are.
     method_files: Mapping[str, str] | None = None
@@ -370,7 +370,7 @@ def key_of(results: Results, capture: CaptureResult, clip: str | None) -> str:
         budget=dict(results.budget),
         frames=results.frames,
         protocols=list(results.protocols.values()),
-        networks=sorted({one.weights for one in METRICS if one.weights and one.name in scored}),
+        networks=sorted({one.needs for one in METRICS if one.needs and one.name in scored}),
         exposed=capture.exposed,
         free_view=clip,
     )
@@ -393,7 +393,7 @@ def evaluate_elsewhere(
     missing = [name for name in networks if name not in known]
     if missing:
         raise HwpError(
-            f"the weights of LPIPS ({', '.join(missing)}) are not on this machine",
+            f"what LPIPS or FLIP needs ({', '.join(missing)}) is not on this machine",
             remedy="Put them on every node, or on none.",
         )
     manifest = read_manifest(inputs["method"] if shipped is None else PACKAGES / shipped)

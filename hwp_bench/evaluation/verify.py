@@ -285,8 +285,8 @@ def _frame_differences(name: str, old: FrameResult, new: FrameResult) -> Iterato
 
 
 def _with_weights() -> set[str]:
-    """Names of the metrics that need weights which may not be here."""
-    return {facts.name for facts in METRICS if facts.weights is not None}
+    """Names of the metrics that need weights or a package which may not be here."""
+    return {facts.name for facts in METRICS if facts.needs is not None}
 
 
 # --- a second opinion: nothing of `hwp_bench.metrics` is used but the protocol's settings, so that

@@ -503,7 +503,8 @@ def _check_data(entry: Entry, capture: CaptureResult, data: CaptureData | None) 
     known = data is not None and (version is not None or data.current is not None)
     if known and version is None:
         raise _wrong(entry, f"{capture.id}.digest", "is not the data of the suite")
-    clips = {version.free_view if version else None, None}
+    same = [one for one in data.versions if one.digest == capture.digest] if data else []
+    clips = {None, *(one.free_view for one in same)}
     if capture.free_view is not None:
         clips = {capture.free_view.digest}
     elif not known and capture.isolation is None:

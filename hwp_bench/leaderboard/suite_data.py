@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from msgspec import Meta
 
@@ -28,6 +28,9 @@ from hwp_bench.taxonomy import REAL_SUITES
 SCHEMA = "hwp-suite-data/2"
 #: The file that ships, next to the entries' folder.
 NAME = "suites.json"
+#: Levels of 8 bits by which pictures of another processor may differ where results on them are
+#: compared frame by frame; renderers that differ in rounding alone reach 11.
+MOST_LEVELS = 11
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,10 @@ class Version:
     digest: Digest
     #: Digest of its free-view clip, which is versioned apart; None where that is not known.
     free_view: Digest | None = None
+    #: Processor that renders it so, where others differ; empty for the one of `current`.
+    processor: Line = ""
+    #: Largest difference of a value of its pictures from those of `current`, in levels of 8 bits.
+    levels: Annotated[int, Meta(ge=0, le=255)] | None = None
 
 
 @dataclass(frozen=True)
@@ -48,11 +55,14 @@ class CaptureData:
     current: Version | None
     #: Versions of it that differ in rounding alone, the latest first: results on them stand.
     former: tuple[Version, ...] = ()
+    #: What this version of the renderer makes of it on processors that round otherwise.
+    others: tuple[Version, ...] = ()
 
     @property
     def versions(self) -> tuple[Version, ...]:
         """All versions that are known, the latest first."""
-        return self.former if self.current is None else (self.current, *self.former)
+        latest = () if self.current is None else (self.current,)
+        return (*latest, *self.others, *self.former)
 
     def version(self, digest: str) -> Version | None:
         """Return the version of that digest, or None."""
@@ -86,18 +96,25 @@ def on_current_data(results: Results) -> Results:
     """Return results with one digest for captures that differ in rounding alone.
 
     Of a simulated capture it is that of this version, of a real clip its origin. So results on such
-    captures can be compared. Other digests stay.
+    captures can be compared. Other digests stay, also those of processors whose pictures differ by
+    more than `MOST_LEVELS`, or by an amount that nobody has measured.
     """
     known, origins = known_data().suites.get(results.suite, {}), suite_origins(results.suite)
     captures = []
     for capture in results.captures:
         data = known.get(capture.id)
-        if data is not None and data.current is not None and data.version(capture.digest):
+        version = data.version(capture.digest) if data is not None else None
+        apart = version is not None and version.processor and not _is_near(version)
+        if data is not None and data.current is not None and version is not None and not apart:
             capture = replace(capture, digest=data.current.digest)
         if (origin := origins.get(capture.id)) and origin == capture.origin:
             capture = replace(capture, digest=origin)
         captures.append(capture)
     return replace(results, captures=captures)
+
+
+def _is_near(version: Version) -> bool:
+    return version.levels is not None and version.levels <= MOST_LEVELS
 
 
 def suite_origins(name: str) -> Mapping[str, str]:
@@ -144,8 +161,18 @@ def rendered_data(cache: Path) -> SuiteData:
     return SuiteData({name: found[name] for name in suite_names() if name in found})
 
 
-def joined_data(known: SuiteData, rendered: SuiteData, *, rounding: bool = False) -> SuiteData:
-    """Return all captures of both, as rendered where a capture is in both."""
+def joined_data(
+    known: SuiteData,
+    rendered: SuiteData,
+    *,
+    rounding: bool = False,
+    processor: str = "",
+    levels: int | None = None,
+) -> SuiteData:
+    """Return all captures of both, as rendered where a capture is in both.
+
+    With the name of a processor, what it renders otherwise is added to what is known.
+    """
     kept = known.suites
     if known.renderer != rendered.renderer:
         kept = {
@@ -155,15 +182,32 @@ def joined_data(known: SuiteData, rendered: SuiteData, *, rounding: bool = False
     both = {name: dict(kept.get(name, {})) for name in suite_names()}
     for name, captures in rendered.suites.items():
         for key, data in captures.items():
-            former = both[name][key].former if key in both[name] else ()
-            both[name][key] = replace(data, former=former)
+            had = both[name].get(key, CaptureData(None))
+            others = had.others if had.current == data.current else ()
+            if processor and had.current is not None and data.current is not None:
+                kept = tuple(one for one in had.others if one.processor != processor)
+                own = replace(data.current, processor=processor, levels=levels)
+                equal = had.current == data.current
+                data, others = had, kept if equal else (*kept, own)
+            both[name][key] = replace(data, former=had.former, others=others)
     suites = {name: captures for name, captures in both.items() if captures}
     return SuiteData(suites, rendered.renderer)
 
 
 def write_suite_data(path: Path, data: SuiteData) -> Path:
     """Write the file; returns it."""
-    return write_json(path, {"schema": SCHEMA, **asdict(data)})
+    return write_json(path, {"schema": SCHEMA, **_without_empty(asdict(data))})
+
+
+def _without_empty(value: Any) -> Any:
+    """The record without optional fields that say nothing."""
+    if isinstance(value, dict):
+        return {
+            key: _without_empty(item)
+            for key, item in value.items()
+            if key in ("current", "free_view", "former") or item not in ("", None, ())
+        }
+    return [_without_empty(item) for item in value] if isinstance(value, tuple) else value
 
 
 def main() -> None:
@@ -175,9 +219,25 @@ def main() -> None:
         help="the renderer so far differs from this one in rounding alone, which `python -m "
         "benchmarks.rounding` measures: results on its captures stand",
     )
-    rounding = parser.parse_args().rounding
+    parser.add_argument(
+        "--processor",
+        default="",
+        help="list digests that differ as those of this kind of processor, and change no other",
+    )
+    parser.add_argument(
+        "--levels",
+        type=int,
+        help="levels by which its pictures differ at most, as `python -m benchmarks.rounding` says",
+    )
+    args = parser.parse_args()
     rendered = rendered_data(cache_root() / "sim" / "captures")
-    joined = joined_data(read_suite_data(), rendered, rounding=rounding)
+    joined = joined_data(
+        read_suite_data(),
+        rendered,
+        rounding=args.rounding,
+        processor=args.processor,
+        levels=args.levels,
+    )
     write_suite_data(data_folder("leaderboard") / NAME, joined)
 
 

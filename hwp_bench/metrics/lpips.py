@@ -1,4 +1,7 @@
-"""LPIPS in plain torch (Zhang et al., CVPR 2018, version 0.1), and where its weights lie.
+"""Distances that not everybody can compute: LPIPS with its weights, FLIP with its package.
+
+LPIPS is in plain torch (Zhang et al., CVPR 2018, version 0.1). FLIP (Andersson et al., HPG 2020) is
+that of NVIDIA's package flip-evaluator.
 
 Nothing is downloaded. The backbone is the torchvision checkpoint in the torch hub cache; the
 linear layers come from the `lpips` package, or torchmetrics, which ships the same bytes. A file
@@ -21,6 +24,8 @@ from hwp_bench.base.errors import BadInput, MissingDependency
 
 if TYPE_CHECKING:
     import torch
+
+    from hwp_bench.metrics.score import Network
 
 
 #: Mean and standard deviation of the images in [-1, 1] that LPIPS was calibrated with.
@@ -162,9 +167,25 @@ def load_lpips(net: str) -> Lpips:
     return Lpips(net, _read_state(backbone, prefixes), _read_state(linear, [LINEAR_DIGESTS[net]]))
 
 
-def load_available() -> dict[str, Lpips]:
-    """Every network whose weights are there, by name; may be empty."""
-    return {net: load_lpips(net) for net in BACKBONE_FILES if lpips_available(net) is None}
+def load_available() -> dict[str, Network]:
+    """LPIPS by backbone where its weights are there, and FLIP where it is installed."""
+    found: dict[str, Network] = {}
+    found |= {net: load_lpips(net) for net in BACKBONE_FILES if lpips_available(net) is None}
+    if importlib.util.find_spec("flip_evaluator") is not None:
+        found["flip"] = flip_map
+    return found
+
+
+def flip_map(prediction: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """LDR-FLIP of two (H, W, 3) float images in [0, 1], sRGB: (H, W) in [0, 1], 0 where alike.
+
+    Viewed as the package assumes: 67 pixels a degree, 0.7 m before a display of 3840 px and 0.7 m.
+    """
+    from flip_evaluator import evaluate
+
+    pair = (np.ascontiguousarray(image, np.float32) for image in (target, prediction))
+    distances, _, _ = evaluate(*pair, "LDR", applyMagma=False, computeMeanError=False)
+    return np.asarray(distances)[..., 0]
 
 
 def torch_home() -> Path:

@@ -113,8 +113,8 @@ class Metric:
     digits: int
     reference: str
     description: str
-    #: The LPIPS backbone whose weights the user must have; None for weight-free metrics.
-    weights: str | None = None
+    #: What the user must have: the weights of an LPIPS backbone, or the package of FLIP ("flip").
+    needs: str | None = None
 
     @property
     def perfect(self) -> float:
@@ -161,6 +161,19 @@ METRICS: tuple[Metric, ...] = (
         "docs/protocol.md; filters of Freeman and Adelson, IEEE TPAMI 13(9), 1991",
         "Weight-free perceptual distance: normalised oriented energies on four scales.",
     ),
+    Metric(
+        "flip",
+        "FLIP",
+        HWP_V1.name,
+        "",
+        False,
+        (0.0, 1.0),
+        1.0,
+        4,
+        "Andersson et al., FLIP: a difference evaluator for alternating images, HPG 2020",
+        "Mean over the scored pixels, at 67 pixels a degree.",
+        "flip",
+    ),
     _lpips("lpips_alex", "LPIPS (alex)", "alex", "AlexNet features on the padded box."),
     _lpips("lpips_vgg", "LPIPS (vgg)", "vgg", "VGG-16 features on the padded box."),
     _psnr("psnr_full", "PSNR (full)", "The whole frame, black outside the scored pixels."),
@@ -190,10 +203,10 @@ def metric_names(networks: Iterable[str] = ()) -> tuple[str, ...]:
     """Names of the metrics that are scored, in table order.
 
     Args:
-        networks: the LPIPS backbones at hand ("alex", "vgg"); without one its metric is absent.
+        networks: what is at hand of "alex", "vgg" and "flip"; without one its metric is absent.
     """
     available = {None, *networks}
-    return tuple(item.name for item in METRICS if item.weights in available)
+    return tuple(item.name for item in METRICS if item.needs in available)
 
 
 def penalty(networks: Iterable[str] = ()) -> dict[str, float]:

@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -33,10 +34,11 @@ from hwp_bench.metrics.pixels import (
     ssim_box,
     ssim_map,
 )
-from hwp_bench.metrics.protocol import HWP_V1, PAPER_WILDGHAND, Protocol, penalty
+from hwp_bench.metrics.protocol import HWP_V1, METRICS, PAPER_WILDGHAND, Protocol, penalty
 
-#: A distance of two (H, W, 3) float images in [0, 1]; `hwp_bench.metrics.lpips.Lpips` is one.
-Network = Callable[[np.ndarray, np.ndarray], float]
+#: A distance of a prediction and a target, (H, W, 3) float in [0, 1]: one number, such as
+#: `hwp_bench.metrics.lpips.Lpips`, or (H, W), of which the mean over the scored pixels is taken.
+Network = Callable[[np.ndarray, np.ndarray], Any]
 #: Largest value of a float image: renderings overshoot 1, and one in 0 to 255 is a mistake.
 FLOAT_LIMIT = 2.0
 
@@ -54,7 +56,7 @@ class _Pair:
     covered: np.ndarray
     #: (H, W) float64, squared error in units of 1, mean over channels; 0 outside `hand`.
     error: np.ndarray
-    #: LPIPS by backbone.
+    #: LPIPS by backbone, and FLIP.
     networks: Mapping[str, Network]
 
 
@@ -76,7 +78,7 @@ def score_frame(
         target: (H, W, 3) like `prediction`.
         mask: (H, W) uint8 (above 127 is hand) or bool, the data set's own visible-hand mask.
         coverage: whether the mask holds the hand's share of each pixel.
-        networks: LPIPS by backbone.
+        networks: LPIPS by backbone, and FLIP: those of `load_available`.
     """
     target = _eight_bits(target, "target", BadImage)
     check_truth(target, mask)
@@ -128,9 +130,7 @@ def _score_hwp_v1(pair: _Pair, protocol: Protocol = HWP_V1) -> dict[str, float]:
         "psnr_edge": decibels(float(pair.error[pair.hand].mean()), cap),
         "ssim_full": _whole_frame_mean(similarity, box, region.shape, radius),
     }
-    for name, network in pair.networks.items():
-        scores[f"lpips_{name}"] = _lpips(pair, region, box, protocol, network)
-    return scores
+    return scores | _network_scores(pair, region, box, protocol)
 
 
 def _score_paper_wildghand(pair: _Pair, protocol: Protocol = PAPER_WILDGHAND) -> dict[str, float]:
@@ -142,9 +142,7 @@ def _score_paper_wildghand(pair: _Pair, protocol: Protocol = PAPER_WILDGHAND) ->
         "paper_psnr": decibels(float(pair.error.sum()) / pair.error.size, protocol.psnr_cap),
         "paper_ssim": ssim_box(x, y, region, protocol.ssim),
     }
-    if "alex" in pair.networks:
-        scores["paper_lpips"] = _lpips(pair, pair.hand, box, protocol, pair.networks["alex"])
-    return scores
+    return scores | _network_scores(pair, pair.hand, box, protocol)
 
 
 def _on_black(image: np.ndarray, box: Box, region: np.ndarray) -> np.ndarray:
@@ -167,13 +165,19 @@ def _whole_frame_mean(
     return float((inside.sum() + (rows * columns - inside.size)) / (rows * columns))
 
 
-def _lpips(
-    pair: _Pair, region: np.ndarray, box: Box, protocol: Protocol, network: Network
-) -> float:
-    """LPIPS of the box, grown to what the network's strides need."""
+def _network_scores(
+    pair: _Pair, region: np.ndarray, box: Box, protocol: Protocol
+) -> dict[str, float]:
+    """LPIPS and FLIP of the box, grown to what the networks' strides need."""
     box = box.at_least(protocol.smallest_lpips_box)
     inside = crop(region, box)
-    return network(_on_black(pair.prediction, box, inside), _on_black(pair.target, box, inside))
+    scores = {}
+    for facts in METRICS:
+        if facts.protocol == protocol.name and facts.needs in pair.networks:
+            images = (_on_black(image, box, inside) for image in (pair.prediction, pair.target))
+            found = np.asarray(pair.networks[facts.needs](*images), np.float64)
+            scores[facts.name] = float(found[inside].mean() if found.ndim else found)
+    return scores
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,6 +37,7 @@ from hwp_bench.report.study_tables import (
     bias_rows,
     bias_table,
     cost_table,
+    discrimination_table,
     rank_table,
     refused_bias,
     robustness_table,
@@ -67,14 +68,14 @@ class TableRequest:
     paper: int | None = None
     #: True appends the published rows.
     published: bool = False
-    #: Name of the method that the robustness table counts from.
+    #: Name of the method that the robustness table counts from, or that is the ceiling.
     base: str | None = None
     #: Capture folders, for severities, novelty and outlines.
     captures: Sequence[str | os.PathLike[str]] = ()
 
 
 #: Tables that show each method, settings and seed once.
-_ONCE = ("rank", "cost", "seeds", "robustness", "free-view", "clean-share")
+_ONCE = ("rank", "discrimination", "cost", "seeds", "robustness", "free-view", "clean-share")
 
 
 def make_table(request: TableRequest) -> Table:
@@ -128,6 +129,8 @@ def _group_table(sources: Sequence[ResultsSource], request: TableRequest) -> Tab
             return robustness_table(sources, request.base)
         case "rank":
             return add_validation_note(rank_table(group_runs(results)), results)
+        case "discrimination":
+            return discrimination_table(group_runs(results), request.base)
         case "free-view":
             return free_view_table(results)
         case "bias":
@@ -143,7 +146,7 @@ def _group_table(sources: Sequence[ResultsSource], request: TableRequest) -> Tab
             table = cost_table(group_runs(results))
         case _:
             table = all_tables(results)[by]
-    if by not in ("seeds", "cost"):
+    if by not in ("seeds", "cost", "discrimination"):
         table = over_seeds(table, results)
     sentence = winner_note(results) if by in VERDICTS else None
     return replace(table, notes=(sentence, *table.notes)) if sentence else table

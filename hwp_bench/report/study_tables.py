@@ -10,7 +10,8 @@ import numpy as np
 from hwp_bench.analysis.columns import Filled, block_breaks, score_column, score_title, table_of
 from hwp_bench.analysis.compare import macro_by_seed, macro_mean, rank_methods, verdict
 from hwp_bench.analysis.cost import BUDGETS, MethodCost, method_costs
-from hwp_bench.analysis.pairing import MethodRuns, common_metrics, group_runs
+from hwp_bench.analysis.discrimination import item_statistics
+from hwp_bench.analysis.pairing import MethodRuns, common_metrics, group_runs, refuse_unlike
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.tables import Cell, Column, Table
 from hwp_bench.capture.schema import CaptureInfo
@@ -327,3 +328,64 @@ def seeds_table(sources: Sequence[ResultsSource]) -> Table:
         ]
     note = "Macro means; the standard deviation is the sample's (n - 1)."
     return table_of("Over seeds", columns, [note])
+
+
+def discrimination_table(runs: Sequence[MethodRuns], base: str | None = None) -> Table:
+    """Return one row a metric and capture: how far it tells methods apart, the best capture first.
+
+    `base` names a method whose scores are the ceiling, such as the truth as an entry; otherwise the
+    ceiling is the score of identical images.
+    """
+    refuse_unlike(runs)
+    ceilings = [run for run in runs if run.first.method.name == base]
+    methods = [run for run in runs if run not in ceilings]
+    if base is not None and not ceilings:
+        raise UsageError(f"no result is of {base!r}", field="--base")
+    if len(methods) < 2:
+        raise UsageError("several methods are needed", field="RESULTS")
+    rows: list[tuple[Cell, ...]] = []
+    breaks: list[int] = []
+    for name in common_metrics(runs, HEADLINE):
+        facts = metric_facts(name)
+        top = {c.id: facts.perfect for c in runs[0].first.captures}
+        if ceilings:
+            top = {one: _seed_means(ceilings[0], one, name).mean() for one in top}
+        scores = {one: [_seed_means(run, one, name) for run in methods] for one in top}
+        own = item_statistics(scores, top, facts.penalty, higher=facts.higher_is_better)
+        own.sort(key=lambda item: -(item.ratio if item.ratio is not None else -1.0))
+        breaks.append(len(rows))
+        for item in own:
+            spreads = (item.between, item.within, item.ratio, item.reliability, item.agreement)
+            rows.append((facts.label, item.capture, *spreads, item.best, item.saturation))
+    columns = (
+        Column("Metric"),
+        Column("Capture"),
+        Column("Methods", 4, group="Spread between"),
+        Column("Seeds", 4, group="Spread between"),
+        Column("Ratio", 1),
+        Column("ICC", 3),
+        Column("Agreement", 2),
+        Column("Best", 4),
+        Column("Saturation", 3),
+    )
+    return Table(
+        "Discrimination",
+        columns,
+        tuple(rows),
+        _DISCRIMINATION,
+        ranked=False,
+        breaks=tuple(breaks[1:]),
+    )
+
+
+_DISCRIMINATION = (
+    "Standard deviations between methods and between seeds of one method (one-way analysis of "
+    "variance); Ratio: the first over the second; ICC: the share of the variance that is methods'.",
+    "Agreement: correlation over methods with the mean of the other captures. Saturation: share of "
+    "the way from a failed frame's score to the ceiling that the best method has gone.",
+)
+
+
+def _seed_means(run: MethodRuns, capture: str, metric: str) -> np.ndarray:
+    """(S,) mean over frames of a capture, one a seed."""
+    return run.values(capture, metric, sorted(run.seeds)).mean(axis=1)

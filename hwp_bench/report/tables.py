@@ -27,7 +27,7 @@ from hwp_bench.suites.suite import lost_clips
 from hwp_bench.taxonomy import PERTURBATIONS, perturbation
 
 #: Metrics of the headline tables, where an evaluation has them.
-HEADLINE = ("psnr", "ssim", "oriented_distance", "lpips_alex", "lpips_vgg")
+HEADLINE = ("psnr", "ssim", "oriented_distance", "flip", "lpips_alex", "lpips_vgg")
 #: Metrics of the tables in the paper's protocol.
 PAPER = ("paper_psnr", "paper_ssim", "paper_lpips")
 #: Heading of the mean over perturbations.

@@ -1,0 +1,45 @@
+"""FLIP as the package computes it, where that is installed; and how it enters the scores."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hwp_bench.metrics import metric_names, penalty
+from hwp_bench.metrics.score import score_frame
+
+
+def _pair() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(0)
+    target = rng.integers(0, 256, (96, 96, 3), dtype=np.uint8)
+    prediction = np.clip(target + rng.normal(0, 20, target.shape), 0, 255).astype(np.uint8)
+    rows, columns = np.mgrid[:96, :96]
+    return prediction, target, (rows - 40) ** 2 + (columns - 50) ** 2 < 30**2
+
+
+def test_a_map_is_averaged_over_the_scored_pixels() -> None:
+    """Oracle: a map that is the squared error gives the mean squared error of PSNR."""
+    prediction, target, mask = _pair()
+    networks = {"flip": lambda x, y: ((x - y) ** 2).mean(axis=2)}
+    scores = score_frame(prediction, target, mask, coverage=True, networks=networks)
+    assert scores["flip"] == pytest.approx(10 ** (-scores["psnr"] / 10), rel=1e-12)
+    assert "flip" not in score_frame(prediction, target, mask, coverage=True)
+    assert set(metric_names(["flip"])) - set(metric_names()) == {"flip"}
+    assert penalty(["flip"])["flip"] == 1.0
+
+
+def test_flip_of_the_box_is_that_of_the_whole_frame_on_black() -> None:
+    """Oracle: the package on the whole frame, the mean over the same pixels; 1e-5 (float32)."""
+    evaluate = pytest.importorskip("flip_evaluator").evaluate
+    from hwp_bench.metrics.lpips import flip_map, load_available
+
+    assert load_available()["flip"] is flip_map
+    prediction, target, mask = _pair()
+    found = score_frame(prediction, target, mask, coverage=True, networks={"flip": flip_map})
+    black = [
+        (np.where(mask[..., None], i, 0) / 255).astype(np.float32) for i in (target, prediction)
+    ]
+    whole = evaluate(*black, "LDR", applyMagma=False)[0][..., 0][mask].mean()
+    assert found["flip"] == pytest.approx(whole, abs=1e-5)
+    same = score_frame(target, target, mask, coverage=True, networks={"flip": flip_map})
+    assert same["flip"] == 0.0
