@@ -85,8 +85,9 @@ def test_examples_are_accepted_by_their_commands(page: Path) -> None:
             pytest.fail(f"{' '.join(words)}: {error}")
 
 
-def test_the_readme_has_commands_to_check() -> None:
-    assert len(example_commands(ROOT / "README.md")) > 12
+def test_the_first_pages_have_commands_to_check() -> None:
+    assert len(example_commands(ROOT / "README.md")) > 5
+    assert len(example_commands(ROOT / "docs" / "install.md")) > 12
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

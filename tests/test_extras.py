@@ -1,4 +1,4 @@
-"""The README's table of extras. Oracle: the extras of pyproject.toml."""
+"""The table of extras. Oracle: the extras of pyproject.toml."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ EXTRAS: dict[str, list[str]] = tomllib.loads((ROOT / "pyproject.toml").read_text
 
 def rows() -> dict[str, str]:
     """What a person gets, by the name of the extra."""
-    section = (ROOT / "README.md").read_text("utf-8").split("## Extras\n")[1].split("\n## ")[0]
+    section = (ROOT / "docs" / "install.md").read_text("utf-8").split("## Extras\n")[1].split("\n## ")[0]
     found = re.findall(r"^\| `([\w-]+)` \| (.+) \|$", section, re.MULTILINE)
     assert len(found) == len(dict(found))
     return dict(found)
@@ -24,7 +24,7 @@ def package(requirement: str) -> str:
     return re.split(r"[\[<>=!~; ]", requirement)[0].lower().replace("_", "-")
 
 
-def test_the_readme_has_a_row_for_every_extra_and_no_other() -> None:
+def test_the_page_has_a_row_for_every_extra_and_no_other() -> None:
     assert set(rows()) == set(EXTRAS)
     assert all(len(words) > 20 for words in rows().values())
 

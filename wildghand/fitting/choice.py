@@ -191,15 +191,15 @@ class JudgedDrawings:
     def _drawn(self, row: int, predicted: Predicted) -> Tensor:
         """(H, W, 3) sRGB over black."""
         dark = {} if self._dark is None else self._dark(torch.tensor([row]))
-        here = slice(row, row + 1)
+        viewmats, Ks = self._clip.viewmats[row : row + 1], self._clip.Ks[row : row + 1]
         found = {
-            side: self.model.dressed(side, hand, refine=self.refine, dark=dark.get(side))
+            side: self.model.dressed(
+                side, hand, refine=self.refine, dark=dark.get(side), viewmats=viewmats
+            )
             for side, hand in predicted.items()
         }
         size = self.training.width, self.training.height
-        image, _ = self.model.rasterize(
-            found, self._clip.viewmats[here], self._clip.Ks[here], *size
-        )
+        image, _ = self.model.rasterize(found, viewmats, Ks, *size)
         return image[0]
 
 

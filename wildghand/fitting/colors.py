@@ -90,12 +90,15 @@ class FilledColors:
     fit: Fit
     #: (N,) by side, how many training frames show each Gaussian.
     shown: Mapping[str, Tensor]
+    #: (N,) bool by side, those amid skin that none shows.
+    unseen: Mapping[str, Tensor]
 
     def carried_on(self, shares: Sequence[float]) -> list[ColorChanges | None]:
         """The changes of colours for some values of `visibility.fill_share`; None: nothing changes.
 
-        With a share of 0 the skin around a place says nothing of it, and the other hand all the
-        same. Colours are compared at normals that the clip's light knows; without one none change.
+        With a share of 0 the skin around a place says nothing of it unless no frame shows it, and
+        the other hand all the same. Colours are compared at normals that the clip's light knows;
+        without one none change.
         """
         model, clip, light = self.fit.model, self.fit.clip, self.fit.model.light
         if light is None or not self.fit.settings.visibility.fill_share:
@@ -104,7 +107,7 @@ class FilledColors:
         levels = {side: log_linear(values) for side, values in logits.items()}
         return [
             changes_to(self._filled(levels, share), logits, self.fit.device)
-            if share > 0.0 or self._joined
+            if share > 0.0 or self._joined or any(bool(each.any()) for each in self.unseen.values())
             else None
             for share in shares
         ]
@@ -128,12 +131,16 @@ class FilledColors:
                 taken = (1.0 - known) * self._kept(other, _LENT * half)
                 values = values + taken[:, None] * (levels[other] - values)
                 known = 1.0 - (1.0 - known) * (1.0 - taken)
-            found[side] = smooth_fill(self._roughness[side], values, known) if share else values
+            if not share:
+                known = np.where(self.unseen[side].cpu(), known, 1.0)
+            filled = bool(share) or known.min() < 1.0
+            found[side] = smooth_fill(self._roughness[side], values, known) if filled else values
         return found
 
     def _kept(self, side: str, half: float) -> np.ndarray:
         """(N,) in [0, 1), how far the colours of a hand are known."""
-        return np.asarray(kept_share(self.shown[side].double().cpu(), half))
+        shown = torch.where(self.unseen[side], 0.0, self.shown[side])
+        return np.asarray(kept_share(shown.double().cpu(), half))
 
     @functools.cached_property
     def _roughness(self) -> dict[str, Any]:
@@ -259,11 +266,16 @@ def changes_to(
     return ColorChanges(changes)
 
 
+def neighbours(rig: HandRig) -> np.ndarray:
+    """(N, 8) int64, the nearest Gaussians on the skin of the resting hand; -1: there are fewer."""
+    return nearest_on_surface(*rest_anchors(rig), _NEIGHBOURS)
+
+
 def roughness(rig: HandRig) -> Any:
     """(N, N) sparse form whose value is the sum of squared differences between neighbours."""
     from scipy.sparse import coo_array, diags_array
 
-    near = nearest_on_surface(*rest_anchors(rig), _NEIGHBOURS)
+    near = neighbours(rig)
     rows, places = np.nonzero(near >= 0)
     edges = coo_array((np.ones(len(rows)), (rows, near[rows, places])), shape=(len(rig), len(rig)))
     edges = 0.5 * (edges + edges.T)

@@ -1,5 +1,8 @@
 """Gaussians that few frames have shown: discs on the skin, as far as validation frames agree.
 
+Those that no frame shows are discs from where the camera never stood, in the colours of the skin
+around them. From behind they are as they were learnt: they shine through the skin that frames show.
+
 Where a person's hand is far from the hand model, offsets from the skin are the person's and not
 errors of depth, and visibility takes away what is right. Where a palm has another colour than the
 back, as that of a glove, the back says nothing of it. Nothing in the training frames tells: they
@@ -17,7 +20,7 @@ from torch import Tensor
 
 from hwp_bench.base.arrays import evenly
 from wildghand.fitting.choice import JudgedDrawings, ValidationFrames, choose
-from wildghand.fitting.colors import FilledColors
+from wildghand.fitting.colors import FilledColors, neighbours
 from wildghand.fitting.fit import Component, Fit
 from wildghand.gaussians.training import TrainingClip
 from wildghand.model.model import WildGHandModel
@@ -26,6 +29,7 @@ from wildghand.visibility import (
     Visibility,
     VisibilitySettings,
     fill_shares,
+    never_shown,
     shown_frames,
     strengths,
     weigh_visibility,
@@ -105,7 +109,11 @@ class Gaps:
         try:
             for side, (pose, betas, transl) in self.clip.parameters.items():
                 with torch.no_grad():
-                    made, hand = model.gaussians(side, pose[here], betas, transl[here])
+                    given = pose[here], betas, transl[here]
+                    dark = model.cast({side: given}).get(side)
+                    predicted = model.predict_hand(side, given, None)
+                    viewmats = self.clip.viewmats[here]
+                    made, hand = model.dressed(side, predicted, dark=dark, viewmats=viewmats)
                 colors[side] = made.colors.detach().clone().requires_grad_()
                 found[side] = replace(made, colors=colors[side]), hand
         finally:
@@ -122,12 +130,14 @@ class FewShown(Component):
 
     Attributes:
         shown: (N,) by side, how many training frames show each Gaussian.
+        unseen: (N,) bool by side, those amid skin that none shows.
         gaps: what discs would leave open.
         filled: the colours of places that few frames have shown.
         judges: validation frames; None where they are too few, or choose nothing.
     """
 
     shown: Mapping[str, Tensor]
+    unseen: Mapping[str, Tensor]
     gaps: Gaps
     filled: FilledColors
     judges: JudgedDrawings | None
@@ -136,9 +146,13 @@ class FewShown(Component):
         """Count, and let the model keep the visibility of the settings' own strength."""
         data, model, count = fit.data, fit.model, len(fit.data.frames)
         self.shown = shown_frames(model.rigs, fit.clip, data.visible, count)
-        model.keep(weigh_visibility(self.shown, count, fit.settings.visibility))
+        self.unseen = {
+            side: never_shown(frames, torch.from_numpy(neighbours(model.rigs[side])).to(fit.device))
+            for side, frames in self.shown.items()
+        }
+        model.keep(self._weigh(fit, fit.settings.visibility))
         self.gaps = Gaps(model, fit.clip, data.visible, count)
-        self.filled = FilledColors(fit, self.shown)
+        self.filled = FilledColors(fit, self.shown, self.unseen)
         frames = fit.part(ValidationFrames)
         self.judges = None if frames is None else frames.drawings
 
@@ -169,7 +183,8 @@ class FewShown(Component):
         """The strengths, the settings' own first; Gaussians that close gaps are spared in each."""
         closers = self.gaps.closers(self._strongest(fit))
         return [
-            self._weigh(fit, each).spare(closers) for each in strengths(fit.settings.visibility)
+            self._weigh(fit, each).spare(closers).without(self.unseen)
+            for each in strengths(fit.settings.visibility)
         ]
 
     def _judged(
@@ -183,10 +198,11 @@ class FewShown(Component):
 
         # Of equal ones the first is taken, which is the settings' own.
         best, least = choose([(each, 0.0) for each in several], error)
+        learnt = best.spare_all().without(self.unseen)
         others = (
             (replace(best, open_wrists=opened), _IN_THE_WAY),
-            (best.spare_all(), _AS_LEARNT),
-            (replace(best.spare_all(), open_wrists=opened), _AS_LEARNT),
+            (learnt, _AS_LEARNT),
+            (replace(learnt, open_wrists=opened), _AS_LEARNT),
         )
         best, _ = choose(others, error, (best, least))
         if fit.model.light is None:
@@ -220,4 +236,5 @@ class FewShown(Component):
         return self._weigh(fit, max(several, key=lambda each: each.offset_share))
 
     def _weigh(self, fit: Fit, settings: VisibilitySettings) -> Visibility:
-        return weigh_visibility(self.shown, len(fit.data.frames), settings)
+        weighed = weigh_visibility(self.shown, len(fit.data.frames), settings)
+        return weighed.without(self.unseen)

@@ -38,6 +38,7 @@ from wildghand.network import (
 from wildghand.poses import ClipPoses
 from wildghand.subject import SubjectShape
 from wildghand.visibility import ColorChanges, Visibility
+from wildghand.visibility.count import facing_of
 
 #: What a model may keep, the attribute that draws by it, and whether it says something of each
 #: Gaussian. Another `Found` needs one line here.
@@ -342,7 +343,7 @@ class WildGHandModel(nn.Module):
         if dark is None:
             dark = self.cast({side: hand}).get(side)
         predicted = self.predict_hand(side, hand, viewmats)
-        return self.dressed(side, predicted, refine=refine, rows=rows, dark=dark)
+        return self.dressed(side, predicted, refine=refine, rows=rows, dark=dark, viewmats=viewmats)
 
     def predict_hand(
         self,
@@ -379,10 +380,12 @@ class WildGHandModel(nn.Module):
         refine: bool = False,
         rows: Tensor | None = None,
         dark: Tensor | None = None,
+        viewmats: Tensor | None = None,
     ) -> tuple[Gaussians, Hand]:
         """The Gaussians of one hand.
 
         Args:
+            viewmats: (B, 4, 4) of the cameras that look at it; None: from everywhere.
             rows: (B,) positions among the training frames, whose biases and gains are added; None:
                 free of perturbations.
             dark: (B, N) factors of the hands' shadows; None: ones.
@@ -391,7 +394,8 @@ class WildGHandModel(nn.Module):
         pose, betas, transl = predicted.hand
         if self.visibility is not None:
             bias = self.network.activation.log_scale_bias
-            settled = self.visibility.settle(side, prediction.raw, rig.spacing, bias)
+            facing = None if viewmats is None else facing_of(anchors, viewmats)
+            settled = self.visibility.settle(side, prediction.raw, rig.spacing, bias, facing)
             prediction = replace(prediction, raw=settled)
         if self.color_changes is not None:
             prediction = replace(prediction, raw=self.color_changes.color(side, prediction.raw))

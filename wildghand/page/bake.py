@@ -208,7 +208,8 @@ def hand_content(
         "base": pack_whole(base),
         "places": pack_whole(places),
         "shifts": pack_whole(shifts),
-        "kept": pack(np.rint(kept * 255.0).astype(np.uint8)),
+        # 0 is of skin that no frame shows.
+        "kept": pack(np.where(kept > 0.0, np.rint(kept * 255.0).clip(min=1.0), 0.0).astype("u1")),
         "disc": _disc(avatar, side),
         "activation": [
             network.activation.max_offset,

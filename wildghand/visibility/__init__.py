@@ -1,6 +1,6 @@
 """Visibility: how much training frames say of each Gaussian, and what holds where they do not."""
 
-from wildghand.visibility.count import shown_frames
+from wildghand.visibility.count import never_shown, shown_frames
 from wildghand.visibility.visibility import (
     ColorChanges,
     Visibility,
@@ -17,6 +17,7 @@ __all__ = [
     "VisibilitySettings",
     "fill_shares",
     "kept_share",
+    "never_shown",
     "shown_frames",
     "strengths",
     "weigh_visibility",

@@ -12,8 +12,10 @@ from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import AnchorPoses, HandRig
 from wildghand.gaussians.training import TrainingClip
 
-# Cosine between normal and viewing direction from which a frame counts.
-_FACING = 0.1
+#: Cosine between normal and viewing direction from which a frame counts.
+FACING = 0.1
+# Frames that show skin, each by how much it counts.
+_SHOWN = 0.1
 # How far an anchor may lie behind the nearest one in its surroundings and still be seen, m: the
 # surface is slanted there, and a finger is thicker.
 _BEHIND = 0.006
@@ -49,6 +51,26 @@ def shown_frames(
     return found
 
 
+def never_shown(shown: Tensor, near: Tensor) -> Tensor:
+    """(N,) bool, the Gaussians amid skin that no training frame shows.
+
+    Skin is shown where the median of a place and its neighbours is a tenth of a frame or more: a
+    single place may be taken for a shown one. Next to it Gaussians are free too, because they may
+    have to reach beyond the hand model there.
+
+    Args:
+        shown: (N,) frames that show each.
+        near: (N, K) int64, neighbours; -1: none.
+    """
+
+    def around(values: Tensor) -> Tensor:
+        neighbours = torch.where(near >= 0, values[near.clamp(min=0)], torch.nan)
+        return torch.cat([values[:, None], neighbours], dim=1)
+
+    skin = around(shown).nanmedian(dim=1).values >= _SHOWN
+    return around(skin.to(shown)).nan_to_num(0.0).amax(dim=1) < 0.5
+
+
 @torch.no_grad()
 def seen_anchors(
     hands: Mapping[str, AnchorPoses], viewmats: Tensor, Ks: Tensor, size: torch.Size
@@ -70,7 +92,7 @@ def seen_anchors(
     for side, hand in hands.items():
         pixels, depth = places[side]
         facing = facing_of(hand, viewmats)
-        seen = facing > _FACING
+        seen = facing > FACING
         seen &= depth < read_images(nearest, pixels / _cell(size[0])) + _BEHIND
         found[side] = pixels, facing * seen
     return found

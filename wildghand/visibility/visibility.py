@@ -21,6 +21,7 @@ from torch.nn.functional import normalize
 from hwp_bench.methods.settings import number
 from wildghand.gaussians.attributes import RawAttributes
 from wildghand.gaussians.found import Found, Kept, read_tensor
+from wildghand.visibility.count import FACING
 
 
 @dataclass(frozen=True)
@@ -63,14 +64,27 @@ class Visibility(Found):
     open_wrists: frozenset[str] = frozenset()
 
     def settle(
-        self, side: str, raw: RawAttributes, spacing: float, log_scale_bias: float
+        self,
+        side: str,
+        raw: RawAttributes,
+        spacing: float,
+        log_scale_bias: float,
+        facing: Tensor | None = None,
     ) -> RawAttributes:
         """Bring Gaussians nearer to discs on the skin, by what is missing of the visibility.
 
         Args:
             spacing: mean distance between neighbouring anchors, m.
+            facing: (B, N) cosine between the skin's normal and the direction to the camera. Of skin
+                that no frame shows, Gaussians are discs only where it faces the camera: training
+                frames have shown them from behind. None: from everywhere.
         """
-        kept, shape = self.offsets[side][:, None], self.shapes[side][:, None]
+        kept, shape = self.offsets[side], self.shapes[side]
+        if facing is not None:
+            behind = 1.0 - (facing / FACING).clamp(0.0, 1.0)
+            kept = torch.where(shape > 0.0, kept, behind)
+            shape = torch.where(shape > 0.0, shape, behind)
+        kept, shape = kept[..., None], shape[..., None]
         disc = raw.log_scales.new_tensor([_WIDE, _WIDE, _THIN]).mul(spacing).log() - log_scale_bias
         # A quaternion and its negative turn alike: the one near the identity is the shorter way.
         quats = normalize(raw.quats, dim=-1)
@@ -103,6 +117,21 @@ class Visibility(Found):
     def spare_all(self) -> Visibility:
         """Keep all of all Gaussians."""
         return self.spare({side: torch.ones_like(share) > 0 for side, share in self.shapes.items()})
+
+    def without(self, unseen: Mapping[str, Tensor]) -> Visibility:
+        """Keep nothing of some Gaussians, those of skin that no frame shows.
+
+        Args:
+            unseen: (N,) bool by side, which.
+        """
+
+        def kept(shares: Mapping[str, Tensor]) -> dict[str, Tensor]:
+            return {
+                side: torch.where(unseen[side], torch.zeros_like(share), share)
+                for side, share in shares.items()
+            }
+
+        return replace(self, offsets=kept(self.offsets), shapes=kept(self.shapes))
 
     def to_tensors(self) -> dict[str, Tensor]:
         """The shares, and whether a wall closes each wrist (1,), as an avatar keeps them."""

@@ -123,7 +123,10 @@ def known_of(fit: Fit, **known: float) -> FilledColors:
     half = 0.02 * len(fit.data.frames)
     frames = {side: half * share / (1.0 - share) for side, share in known.items()}
     counts = {side: len(rig) for side, rig in fit.model.rigs.items()}
-    return FilledColors(fit, {s: torch.full((counts[s],), n) for s, n in frames.items()})
+    shown = {s: torch.full((counts[s],), n) for s, n in frames.items()}
+    return FilledColors(
+        fit, shown, {s: torch.zeros(n, dtype=torch.bool) for s, n in counts.items()}
+    )
 
 
 @pytest.mark.parametrize("share", [0.02, 0.1, 0.0])
@@ -196,6 +199,30 @@ def test_without_judges_the_settings_share_holds_and_an_avatar_keeps_it(
     assert np.abs(drawn - before).max() > 0.01
     again = load_avatar(save_avatar(fit.avatar(0), tmp_path / "avatar"))
     np.testing.assert_array_equal(again.render(*where), drawn)
+
+
+def test_skin_that_no_frame_shows_takes_the_colours_around_it_with_any_share(
+    make_training: TrainingMaker,
+) -> None:
+    fit = begun(make_training("right"))
+    rig = fit.model.rigs["right"]
+    unseen = torch.from_numpy(rest_anchors(rig)[0][:, 0] < np.median(rest_anchors(rig)[0][:, 0]))
+    shown = torch.full((len(rig),), 10.0)
+    before = levels(fit, "right")
+    # Other colours there, as noise would leave.
+    with torch.no_grad():
+        fit.model.network.identity.maps["right"][:, COLORS] += 0.3
+    filled = FilledColors(fit, {"right": shown}, {"right": unseen})
+    (found,) = filled.carried_on([0.0])
+    assert found is not None
+    after = levels(fit, "right", found.changes["right"])
+    seen = ~unseen.numpy()
+    shifted = levels(fit, "right")
+    np.testing.assert_allclose(after[seen], shifted[seen], atol=1e-3)
+    # The oracle: a fill that knows nothing there and all elsewhere.
+    expected = smooth_fill(roughness(rig), shifted, seen.astype(float))
+    np.testing.assert_allclose(after, expected, atol=1e-3)
+    assert np.abs(after[~seen] - before[~seen]).max() > 0.01
 
 
 def test_known_normals_lie_in_the_cap() -> None:

@@ -10,7 +10,9 @@ import copy
 import dataclasses
 import json
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -18,6 +20,7 @@ import numpy as np
 import pytest
 import torch
 from browser import least_contrast, open_page, overflow, show
+from scipy.spatial.transform import Rotation
 from tiny_fits import TINY
 
 import wildghand
@@ -101,19 +104,40 @@ def test_the_page_draws_training_poses_as_the_avatar(opened, fitted) -> None:
         assert psnr(drawn(opened, capture, frame), truth[..., :3], truth[..., 3]) > LEAST
 
 
+@pytest.mark.parametrize("turn", [60, 180, 270])
+def test_the_page_draws_a_hand_from_where_no_camera_stood(turn: int, opened, fitted) -> None:
+    avatar, capture = fitted
+    assert bool((avatar.model.visibility.shapes["right"] == 0.0).any())
+    frame = avatar.record.frames[3]
+    hand, camera = capture.hand_poses(frame)["right"], capture.camera(frame)
+    centre = camera.viewmat[:3, :3] @ avatar.pose({"right": hand}).means.mean(axis=0)
+    centre += camera.viewmat[:3, 3]
+    around = np.eye(4)
+    around[:3, :3] = Rotation.from_euler("y", turn, degrees=True).as_matrix()
+    around[:3, 3] = centre - around[:3, :3] @ centre
+    moved = replace(camera, viewmat=around @ camera.viewmat)
+    given = {"right": [hand.pose.tolist(), hand.transl.tolist()]}
+    opened.execute_script("avatar.setPose(arguments[0])", given)
+    truth = avatar.render({"right": hand}, moved)
+    found = drawn(opened, SimpleNamespace(camera=lambda frame: moved), frame)
+    # The light of unknown normals differs by some hundredths.
+    assert psnr(found, truth[..., :3], truth[..., 3]) > 30.0
+
+
 def biased(avatar: WildGHandAvatar, capture: Capture, frame: int) -> np.ndarray:
     """(H, W, 4) of the model's Gaussians with the biases of a training frame."""
     given = avatar.posed({"right": capture.hand_poses(frame)["right"]})["right"]
     rows, camera = torch.tensor([avatar.record.frames.index(frame)]), capture.camera(frame)
     with torch.no_grad():
-        made, _ = avatar.model.gaussians("right", *given, rows=rows)
+        viewmats = torch.as_tensor(camera.viewmat[None], dtype=torch.float32)
+        made, _ = avatar.model.gaussians("right", *given, rows=rows, viewmats=viewmats)
         image, cover, _ = rasterize(
             made.means,
             made.quats,
             made.scales,
             made.opacities,
             made.colors,
-            torch.as_tensor(camera.viewmat[None], dtype=torch.float32),
+            viewmats,
             torch.as_tensor(camera.K[None], dtype=torch.float32),
             camera.width,
             camera.height,

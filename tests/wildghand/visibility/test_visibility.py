@@ -22,6 +22,7 @@ from wildghand.visibility import (
     ColorChanges,
     Visibility,
     VisibilitySettings,
+    never_shown,
     shown_frames,
     weigh_visibility,
 )
@@ -62,6 +63,35 @@ def test_without_visibility_gaussians_are_opaque_discs_on_the_skin_in_their_colo
     torch.testing.assert_close(drawn.quats[..., 0], torch.ones(2, 40))
     assert drawn.opacities.min() > 0.98
     torch.testing.assert_close(drawn.colors, activation(raw).colors)
+
+
+def test_skin_that_no_frame_shows_is_as_learnt_from_behind_and_discs_from_the_front() -> None:
+    raw, bias = raw_attributes(), Activation().log_scale_bias
+    # A twentieth in front of the tangent plane is half of the way to where a frame counts.
+    facing = torch.tensor([-0.5, 0.0, 0.05, 0.1, 0.9]).repeat(2, 8)
+    none = visibility(0.0, 0.0)
+    found = none.settle("right", raw, SPACING, bias, facing).concatenate()
+    learnt = visibility(1.0, 1.0).settle("right", raw, SPACING, bias).concatenate()
+    discs = none.settle("right", raw, SPACING, bias).concatenate()
+    half = visibility(0.5, 0.5).settle("right", raw, SPACING, bias).concatenate()
+    for expected, near in ((learnt, facing <= 0.0), (half, facing == 0.05), (discs, facing >= 0.1)):
+        torch.testing.assert_close(found[near], expected[near])
+    # Elsewhere the camera has no say.
+    some = visibility(0.3, 0.3)
+    seen = some.settle("right", raw, SPACING, bias, facing).concatenate()
+    assert torch.equal(seen, some.settle("right", raw, SPACING, bias).concatenate())
+
+
+def test_a_single_place_is_not_shown_and_the_rim_of_what_is_shown_is_free() -> None:
+    # Places in a row, each the neighbour of the two on either side.
+    row = torch.arange(30)
+    near = torch.stack([row - 2, row - 1, row + 1, row + 2], dim=1)
+    near[(near < 0) | (near > 29)] = -1
+    shown = torch.zeros(30)
+    shown[:10] = 2.0
+    shown[20] = 5.0
+    # Skin is shown up to place 9, and two more places are free.
+    assert never_shown(shown, near).nonzero()[:, 0].tolist() == list(range(12, 30))
 
 
 def amounts(most: float) -> st.SearchStrategy[float]:

@@ -154,7 +154,8 @@ void carryOn(int row, Place own) {
   harmonic(own.normal);
 }
 // wildghand/visibility: the nearer to a disc on the skin, the less frames say of a Gaussian.
-void settle(vec2 kept) {
+void settle(vec2 kept, float facing) {
+  if (kept.y <= 0.0) kept = vec2(1.0 - clamp(facing / 0.1, 0.0, 1.0));
   vec4 q = vec4(raw[1].zw, raw[2].xy);
   q = normalize(q) * (q.x < 0.0 ? -1.0 : 1.0);
   q = vec4(1, 0, 0, 0) + kept.y * (q - vec4(1, 0, 0, 0));
@@ -193,7 +194,7 @@ void main() {
   } else {
     askLit(row, own.normal);
     carryOn(row, own);
-    settle(texel(gaussians, t + 1).zw);
+    settle(texel(gaussians, t + 1).zw, dot(normalize(eye - own.at), own.normal));
     if (biased) perturb(row);
   }
   vec3 color = shadow * own.dark * gain / (1.0 + exp(-vec3(raw[2].w, raw[3].xy)));
