@@ -49,6 +49,7 @@ class Method:
 """
 _MANIFEST = """
 schema = "hwp-method/1"
+training = "none"
 name = "gray"
 [entry]
 python = "gray_method:Method"

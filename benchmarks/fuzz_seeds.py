@@ -24,6 +24,7 @@ class Method:
         return np.full((camera.height, camera.width, 4), self.level)
 """
 _MANIFEST = """schema = "hwp-method/1"
+training = "none"
 name = "gray"
 title = "Gray"
 description = "One level of gray"
@@ -99,7 +100,8 @@ def _write_submission(folder: Path) -> None:
     kept = next((folder / "results").rglob("predictions"))
     shutil.copytree(kept, made / "predictions" / "seed")
     (made / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "handed-in"\n[entry]\npredictions = "predictions"\n'
+        'schema = "hwp-method/1"\ntraining = "none"\n'
+        'name = "handed-in"\n[entry]\npredictions = "predictions"\n'
     )
 
 

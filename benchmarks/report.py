@@ -32,6 +32,7 @@ from hwp_bench.results import (
     FrameResult,
     MethodId,
     Results,
+    TrainingData,
     write_results,
 )
 from hwp_bench.taxonomy import PERTURBATIONS
@@ -106,7 +107,7 @@ def make_capture(rng: np.random.Generator, number: int, method: int) -> CaptureR
 def make_results(name: str, seed: int, captures: list[CaptureResult]) -> Results:
     """One run of a method."""
     return Results(
-        method=MethodId(name, name.title(), "m", "default", {"steps": 1000}),
+        method=MethodId(name, name.title(), "m", "default", {"steps": 1000}, TrainingData()),
         suite="full",
         seed=seed,
         budget={"seconds": None, "steps": None},

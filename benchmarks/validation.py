@@ -1,24 +1,31 @@
 """Scores of a method's settings on validation frames: what a baseline is tuned with.
 
-Run from the repository, with a `--set` for each row:
-`python -m benchmarks.validation baselines/trimmed --captures wild-dev-0 --set patch=false`
-fits each capture with the preset, and once more with each `--set`, and prints mean PSNR over the
-validation frames. Test frames are neither read nor rendered.
+Run from the repository: `python -m benchmarks.validation trimmed wild` fits the captures that
+`trials.toml` names for a baseline with its preset, and once more with each of the six trials there,
+and prints mean PSNR over the validation frames. Other rows are asked for like this:
+`python -m benchmarks.validation trimmed --captures wild-dev-0 --set patch=false`.
+
+With `--seconds` fits end after so many processor seconds. Test frames are read with `--test` alone,
+which shows what a setting brings: nothing is tuned by it.
 """
 
 from __future__ import annotations
 
 import argparse
 import tempfile
+import time
+import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from hwp_bench.base.records import merged
 from hwp_bench.capture import open_capture
 from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.cli.options import overrides
+from hwp_bench.evaluation.evaluate import make_budget
 from hwp_bench.evaluation.scoring import Prediction, mean_scores, read_targets, score_predictions
 from hwp_bench.methods import find_method, read_manifest
 from hwp_bench.methods.contract import Avatar, Budget, RunSettings
@@ -27,10 +34,21 @@ from hwp_bench.run.worker import load_entry, render
 from hwp_bench.sim.produce.capture import ensure_suite, suite
 
 
-class _Quiet:
-    """A report that keeps nothing."""
+def read_trials() -> dict[str, dict[str, list[str]]]:
+    """Captures, and texts of settings, by the name of a baseline."""
+    return tomllib.loads(Path(__file__).with_name("trials.toml").read_text(encoding="utf-8"))
 
-    elapsed = 0.0
+
+class _Quiet:
+    """A report that keeps nothing; its clock counts processor seconds."""
+
+    def __init__(self) -> None:
+        self._begun = time.process_time()
+
+    @property
+    def elapsed(self) -> float:
+        """Processor seconds since it was made."""
+        return time.process_time() - self._begun
 
     def __call__(self, step: int, avatar: Avatar) -> None:
         """Do nothing."""
@@ -39,8 +57,14 @@ class _Quiet:
         """Do nothing."""
 
 
-def validation_score(
-    method: str, capture: Path, settings: Mapping[str, Any], steps: int, seed: int
+def score_fit(
+    method: str,
+    capture: Path,
+    settings: Mapping[str, Any],
+    budget: Budget,
+    seed: int,
+    *,
+    test: bool = False,
 ) -> float:
     """Fit a method to the training frames of a capture, and score its validation frames.
 
@@ -48,46 +72,65 @@ def validation_score(
         method: its folder, or its name.
         capture: a capture folder.
         settings: all that differ from the defaults.
-        steps: optimizer steps.
+        budget: in optimizer steps or processor seconds.
         seed: of everything random.
+        test: score the test frames in place of these.
 
     Returns:
-        mean PSNR over the validation frames, dB, by the protocol's mask.
+        mean PSNR over the frames, dB, by the protocol's mask.
     """
     folder = find_method(method)
-    opened, budget = open_capture(capture), Budget(steps=steps)
+    opened = open_capture(capture)
     split = contiguous_split(opened.info.id, opened.info.frame_count)
     with tempfile.TemporaryDirectory() as place:
         run = RunSettings(settings, seed, budget)
         training = open_request(write_request(Path(place) / "request", opened, split, run))
         entry = load_entry(folder, str(read_manifest(folder).entry.python))
         avatar = entry(training.run.settings, seed).fit(training, budget, _Quiet())
-        frames = split.validation.tolist()
+        frames = (split.test if test else split.validation).tolist()
         made = [Prediction(frame, render(avatar, training, frame), None) for frame in frames]
     return mean_scores(score_predictions(read_targets(opened, frames), made))["psnr"]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("method", help="method directory, or the name of a shipped method")
+    text = "method directories, or names of shipped methods"
+    parser.add_argument("methods", nargs="+", metavar="METHOD", help=text)
     parser.add_argument("--suite", default="wild-dev", help="where the captures are from")
-    parser.add_argument("--captures", nargs="+", required=True, help="their names")
-    parser.add_argument("--preset", default="mini")
+    parser.add_argument("--captures", nargs="+", help="their names (default: those of trials.toml)")
+    parser.add_argument("--preset", default="smoke")
     parser.add_argument("--steps", type=int, default=400)
+    parser.add_argument("--seconds", type=float, help="processor seconds of a fit, without --steps")
+    parser.add_argument("--test", action="store_true", help="score test frames; never tune by it")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
-        "--set", action="append", default=[], help="NAME=VALUE,...: one more row of the table"
+        "--set",
+        action="append",
+        help="NAME=VALUE,...: one row of the table, in place of the trials",
     )
     arguments = parser.parse_args()
-    items = [item for item in suite(arguments.suite) if item.scene.id in arguments.captures]
+    for method in arguments.methods:
+        print_table(method, arguments)
+
+
+def print_table(method: str, arguments: argparse.Namespace) -> None:
+    """Print one row for the preset and for each trial of a method."""
+    manifest = read_manifest(find_method(method))
+    listed = read_trials().get(manifest.name, {"captures": [], "trials": []})
+    names = arguments.captures or listed["captures"]
+    trials = listed["trials"] if arguments.set is None else arguments.set
+    items = [item for item in suite(arguments.suite) if item.scene.id in names]
     captures = ensure_suite(items, free_view=False)
-    preset = read_manifest(find_method(arguments.method)).presets[arguments.preset]
-    print("| settings |", " | ".join(item.scene.id for item in items), "| mean |")
+    budget = Budget(steps=arguments.steps)
+    if arguments.seconds is not None:
+        budget = make_budget(arguments.seconds, None)
+    preset = manifest.presets[arguments.preset]
+    print(f"\n| {manifest.name} |", " | ".join(item.scene.id for item in items), "| mean |")
     print("| --- |" + " ---: |" * (len(items) + 1), flush=True)
-    for text in ["", *arguments.set]:
-        settings = {**preset, **overrides(text.split(",") if text else [])}
+    for text in ["", *trials]:
+        settings = merged(preset, overrides(text.split(",") if text else []))
         scores = [
-            validation_score(arguments.method, path, settings, arguments.steps, arguments.seed)
+            score_fit(method, path, settings, budget, arguments.seed, test=arguments.test)
             for path in captures
         ]
         cells = " | ".join(f"{score:.2f}" for score in (*scores, float(np.mean(scores))))

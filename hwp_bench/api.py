@@ -23,10 +23,11 @@ from hwp_bench.evaluation.evaluate import (
     check_results_place,
     check_suite,
     default_folder,
+    make_budget,
 )
 from hwp_bench.evaluation.evaluate import evaluate as evaluate_method
 from hwp_bench.evaluation.sentences import outcome_lines
-from hwp_bench.methods.contract import Budget, RunSettings
+from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.manifest import find_method, read_manifest
 from hwp_bench.metrics.score import score_frame
 from hwp_bench.report.tables import HEADLINE
@@ -70,7 +71,8 @@ def evaluate(
         preset: preset of the method; the suite's, else `default`, if None.
         settings: settings that override the preset, such as `{"dpd.enabled": False}`.
         seed: seed of everything random.
-        seconds: limit of the fit on the method's clock, s.
+        seconds: limit of the fit on the method's clock, s; without `steps` it lifts the preset's
+            limit of steps.
         steps: limit of the fit in optimizer steps.
         frames: training frames that the method is given: `perturbed`, or an oracle's (`clean`,
             `unperturbed-only`).
@@ -99,7 +101,7 @@ def evaluate(
     plan = EvaluationSettings(
         suite=suite,
         preset=preset,
-        run=RunSettings(dict(settings or {}), seed, Budget(seconds, steps), frames),
+        run=RunSettings(dict(settings or {}), seed, make_budget(seconds, steps), frames),
     )
     folder = place(out, "out") if out is not None else default_folder(method, plan)
     manifest = read_manifest(find_method(method))

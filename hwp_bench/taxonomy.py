@@ -155,6 +155,23 @@ SIMULATED_SUITES = (
 REAL_SUITES = ("real-1",)
 #: Every suite.
 SUITES = (*SIMULATED_SUITES, *REAL_SUITES)
+#: What each suite is, in a few words for people.
+SUITE_TEXTS: Mapping[str, str] = MappingProxyType(
+    {
+        "smoke": "two captures, to see that a method runs",
+        "mini": "eight of the paper's captures, simulated and short",
+        "full-lite": "the paper's eleven captures, simulated, every twelfth frame",
+        "full": "the paper's eleven captures, simulated, every frame",
+        "wild-dev": "simulated hands as various as the world, for tuning",
+        "wild-test": "simulated hands as various as the world, on which nothing was tuned",
+        "persistent": "simulated, with perturbations that last: 10 % of training frames are clean",
+        "real-1": "real clips, on which nothing was tuned",
+    }
+    | {
+        f"persistent-clean{share}": f"as persistent, with {share} % of training frames clean"
+        for share in (0, 20, 35, 60)
+    }
+)
 #: Suites whose captures have the frames and the size of another one: the preset that a method
 #: has for that one fits them too.
 SIZED_LIKE: Mapping[str, str] = MappingProxyType(

@@ -122,6 +122,7 @@ class Gray:
 
 _MANIFEST = """
 schema = "hwp-method/1"
+training = "none"
 name = "gray"
 [entry]
 python = "gray_method:Gray"

@@ -12,7 +12,14 @@ import numpy as np
 from hwp_bench.base.files import sha256_json
 from hwp_bench.capture import Cameras, Capture, HandModelId, identify_hand_model
 from hwp_bench.hands.skeleton import HandParameters
-from hwp_bench.results import CaptureResult, CurvePoint, FrameResult, MethodId, Results
+from hwp_bench.results import (
+    CaptureResult,
+    CurvePoint,
+    FrameResult,
+    MethodId,
+    Results,
+    TrainingData,
+)
 
 CaptureMaker = Callable[..., Capture]
 
@@ -95,7 +102,7 @@ def results_example(name: str = "plain", psnr: float = 20.0, digest: str = "d") 
         curve=[CurvePoint(5, 1.0, 10**8, {"psnr": 15.0})],
     )
     return Results(
-        method=MethodId(name, name.title(), "m", "default", {"steps": 10}),
+        method=MethodId(name, name.title(), "m", "default", {"steps": 10}, TrainingData()),
         suite="smoke",
         seed=0,
         budget={"seconds": None, "steps": None},

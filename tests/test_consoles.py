@@ -79,7 +79,8 @@ def places(make_capture: CaptureMaker, tmp_path: Path) -> dict[str, str]:
     for frame in (18, 19):
         write_image(entry / "predictions" / "tiny" / f"{frame:06d}.png", capture.frame(frame))
     (entry / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "truth"\n[entry]\npredictions = "predictions"\n'
+        'schema = "hwp-method/1"\ntraining = "none"\n'
+        'name = "truth"\n[entry]\npredictions = "predictions"\n'
     )
     for name, level in (("A", 25.0), ("B", 20.0)):
         made = made_results(name.lower(), lambda c, f, s, level=level: level + c + 0.1 * f)

@@ -141,7 +141,7 @@ def test_the_examples_of_the_method_contract_run(
     manifest = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)[0]
     code = re.findall(r"```python\n(.*?)```", page, re.DOTALL)[example]
     if settings is not None:
-        head = 'schema = "hwp-method/1"\nname = "capped"\ntitle = "Capped"\n'
+        head = 'schema = "hwp-method/1"\ntraining = "none"\nname = "capped"\ntitle = "Capped"\n'
         manifest = f'{head}[entry]\npython = "my_package.my_module:{entry}"\n{settings}'
     method = tmp_path / "method"
     (method / "my_package").mkdir(parents=True)

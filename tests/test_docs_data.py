@@ -60,7 +60,8 @@ def submission(folder: Path, captures: list[Path]) -> None:
             place = folder / "predictions" / capture.info.id / f"{frame:06d}.png"
             write_image(place, capture.frame(frame) // 2)
     (folder / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "darker"\n[entry]\npredictions = "predictions"\n'
+        'schema = "hwp-method/1"\ntraining = "none"\n'
+        'name = "darker"\n[entry]\npredictions = "predictions"\n'
     )
 
 

@@ -85,7 +85,8 @@ def here(make_capture: CaptureMaker, tmp_path: Path, monkeypatch: pytest.MonkeyP
     for name in ("A", "D", "M"):
         (tmp_path / name).mkdir()
     (tmp_path / "M" / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "m"\n[entry]\npredictions = "predictions"\n'
+        'schema = "hwp-method/1"\ntraining = "none"\n'
+        'name = "m"\n[entry]\npredictions = "predictions"\n'
     )
     (tmp_path / "M" / "predictions").mkdir()
     for name in ("V", "L", "revealed"):

@@ -57,7 +57,7 @@ def test_a_thief_who_knows_the_way_gets_no_test_frame(
     places = [str(capture.root / "frames"), str(out / "captures" / "tiny" / "pictures")]
     (method / "run.py").write_text(THIEF.format(places=places))
     (method / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "thief"\n[entry]\n'
+        'schema = "hwp-method/1"\ntraining = "none"\nname = "thief"\n[entry]\n'
         'command = ["{python}", "{method}/run.py", "{request}", "{output}"]\n'
     )
     results = evaluate(

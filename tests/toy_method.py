@@ -38,6 +38,7 @@ times = [{"step": 50, "seconds": 1.0, "peak_memory": 1000},
 
 _MANIFEST = """
 schema = "hwp-method/1"
+training = "none"
 name = "toy"
 title = "Toy"
 [entry]

@@ -24,7 +24,7 @@ from hwp_bench.cli.options import (
     print_result,
     splits_of,
 )
-from hwp_bench.taxonomy import REAL_SUITES
+from hwp_bench.taxonomy import REAL_SUITES, SUITES
 
 if TYPE_CHECKING:
     from hwp_bench.capture.check import CheckReport
@@ -364,6 +364,26 @@ def _inputs(args: argparse.Namespace) -> int:
     return print_result(args.json, value, lines)
 
 
+_CARD = """examples:
+  hwp-bench data card mini > mini.json
+
+Croissant 1.0 (JSON-LD): captures with hands, perturbations, frames, split and digests, licence, and
+for real clips the addresses of the videos with their SHA-256. Nothing is rendered or downloaded.
+"""
+
+
+def _add_card(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = _CARD
+    parser.add_argument("suite", choices=SUITES, metavar="SUITE", help="name of a suite")
+
+
+def _card(args: argparse.Namespace) -> int:
+    from hwp_bench.leaderboard.data_card import data_card
+
+    print_json(data_card(args.suite))
+    return 0
+
+
 _PUBLISH = """examples:
   hwp-bench data publish captures/* -o publication
   hwp-bench data publish captures/* -o publication --splits splits/mine.json
@@ -517,6 +537,7 @@ COMMANDS = {
     "get": (_add_get, _get),
     "track": (_add_track, _track),
     "inputs": (_add_inputs, _inputs),
+    "card": (_add_card, _card),
     "publish": (_add_publish, _publish),
     "second_view": (_add_second_view, _second_view),
     "convert": (_add_convert, _convert),

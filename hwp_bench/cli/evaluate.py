@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from hwp_bench.base.console import JobsView, notice
-from hwp_bench.base.errors import UsageError
-from hwp_bench.base.tables import Column, Table, print_table, write_tables
+from hwp_bench.base.errors import BadMethod, MethodFailed, UsageError
+from hwp_bench.base.tables import Column, Table, print_table, to_object, write_tables
 from hwp_bench.cli.options import (
     SEVERAL,
     add_json,
@@ -42,6 +42,10 @@ _EVALUATE = """examples:
   hwp-bench evaluate authors --capture compat/capture0     # after `data import rendered`
   hwp-bench evaluate my_method --suite mini --jobs 4                 # four captures at once
   hwp-bench evaluate my_method --suite full --engine ray://10.0.0.1:6379 --job-gpus 1
+  hwp-bench evaluate plain trimmed my_method --suite wild-test --seeds 3 --budget 64 -o runs/field
+
+Several methods or seeds have a folder each, OUT/METHOD/seed-N; one table at the end compares them,
+and `hwp-bench table OUT` shows others. A method that cannot be run is named and left out.
 
 An evaluation that is started again with the same arguments keeps finished captures. A folder with
 results of other arguments is refused, and what differs is said; with --overwrite they are
@@ -55,14 +59,18 @@ _METHOD_HELP = "method directory, or the name of a shipped method"
 def _add_evaluate(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EVALUATE
     add = parser.add_argument
-    add("method", metavar="METHOD_DIR", help=_METHOD_HELP)
+    add("methods", nargs="+", metavar="METHOD_DIR", help=_METHOD_HELP)
     _add_evaluation(parser)
     sealed = "sealed part of a publication, instead of captures; checked against its commitment"
     add("--sealed", metavar="DIR", help=sealed)
     out = "oracle, budget and a seed other than 0 are added to the name"
-    add("-o", "--out", help=f"results folder (default runs/METHOD-SUITE; {out})")
-    add("--seed", type=int, default=0, help="seed of everything random")
-    add_json(parser, "print the result file")
+    text = f"results folder (default runs/METHOD-SUITE, of several runs/field-SUITE; {out})"
+    add("-o", "--out", help=text)
+    seeds = parser.add_mutually_exclusive_group()
+    seeds.add_argument("--seed", type=int, default=0, help="seed of everything random")
+    text = "evaluate with the seeds 0 to N - 1 (default: with one seed)"
+    seeds.add_argument("--seeds", type=int, default=1, metavar="N", help=text)
+    add_json(parser, "print the result file; of several methods or seeds, files and table")
 
 
 def _add_evaluation(parser: argparse.ArgumentParser) -> None:
@@ -75,7 +83,8 @@ def _add_evaluation(parser: argparse.ArgumentParser) -> None:
     kinds = ("perturbed", "clean", "unperturbed-only")
     text = "training frames to use; all but the first are oracles on simulated captures"
     add("--frames", choices=kinds, default="perturbed", help=text)
-    add("--budget", type=float, metavar="SECONDS", help="limit of the fit's time")
+    text = "limit of the fit's time; without --steps it lifts the preset's limit of steps"
+    add("--budget", type=float, metavar="SECONDS", help=text)
     add("--steps", type=int, help="limit of the fit's optimizer steps")
     text = "kill the method after this time on one capture (default 3600)"
     add("--time-limit", type=float, default=3600.0, metavar="SECONDS", help=text)
@@ -101,15 +110,19 @@ def _evaluate(args: argparse.Namespace) -> int:
     from hwp_bench.methods.manifest import find_method, read_manifest
     from hwp_bench.report.tables import all_tables, free_view_tables
 
+    _check_seeds(args.seeds)
     settings = _evaluation_settings(args)
     sealed = _sealed_part(args)
     if sealed is not None:
         settings = replace(settings, suite=f"sealed-{sealed.commitment[:12]}")
-    manifest = read_manifest(find_method(args.method))
-    out = Path(args.out) if args.out else default_folder(args.method, settings)
-    with _running(args, manifest, settings, out, sealed) as (captures, jobs, options):
+    if len(args.methods) > 1 or args.seeds > 1:
+        return _evaluate_several(args, settings, sealed)
+    (method,) = args.methods
+    out = Path(args.out) if args.out else default_folder(method, settings)
+    call = Call(read_manifest(find_method(method)), settings, out)
+    with _running(args, [call], sealed) as (captures, jobs, options):
         turn = jobs.turn if jobs else None
-        results = evaluate(args.method, captures, out, settings, on_capture=turn, **options)
+        results = evaluate(method, captures, out, settings, on_capture=turn, **options)
     if args.json:
         print_json(asdict(results))
     elif results.drawn:
@@ -122,17 +135,73 @@ def _evaluate(args: argparse.Namespace) -> int:
     return _report_outcome(out, results)
 
 
+class Call(NamedTuple):
+    """A method, how it is evaluated, and its results folder."""
+
+    manifest: MethodManifest
+    settings: EvaluationSettings
+    out: Path
+
+
+def _evaluate_several(
+    args: argparse.Namespace, settings: EvaluationSettings, sealed: SealedPart | None
+) -> int:
+    """Evaluate several methods and seeds, seed by seed, and compare them in one table."""
+    from hwp_bench.evaluation.evaluate import default_folder, evaluate
+    from hwp_bench.methods.manifest import find_method, read_manifest
+    from hwp_bench.report.requested_table import TableRequest, make_table
+    from hwp_bench.results.store import seed_folder
+
+    out = Path(args.out) if args.out else default_folder("field", settings)
+    manifests = [read_manifest(find_method(method)) for method in args.methods]
+    names = [manifest.name for manifest in manifests]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        problem = f"{twice!r} is the name of two of the methods, and of one folder"
+        raise UsageError(problem, field="METHOD_DIR", remedy="Name each method once.")
+    calls = []
+    for seed in range(args.seeds) if args.seeds > 1 else [args.seed]:
+        own = replace(settings, run=replace(settings.run, seed=seed))
+        calls += [Call(each, own, seed_folder(out, each.name, seed)) for each in manifests]
+    done, status = [], 0
+    with _running(args, calls, sealed) as (captures, jobs, options):
+        for index, (manifest, own, folder) in enumerate(calls):
+            head = f"{manifest.title}, seed {own.run.seed}, "
+            notice(f"{head}{index + 1} of {len(calls)}")
+            options["rehearse"] = options["rehearse"] and index < len(manifests)
+            options["on_capture"] = jobs.turn if jobs else None
+            try:
+                results = evaluate(str(manifest.root), captures, folder, own, **options)
+            except (BadMethod, MethodFailed) as error:
+                # The others are worth having, and this one can be started again.
+                notice(f"{head}not evaluated: {error}")
+                status = 1
+                continue
+            status |= _notice_failures(folder, results, head)
+            done += [folder] if results.drawn else []
+    by = "rank" if len(manifests) > 1 else "seeds"
+    table = make_table(TableRequest(done, by)) if done else None
+    if args.json:
+        files = [str(folder / "results.json") for folder in done]
+        print_json({"results": files, "table": table and to_object(table)})
+    elif table is not None:
+        print_table(table)
+    notice(f"results: {out}; more tables: hwp-bench table {out} --by NAME")
+    return status
+
+
+def _check_seeds(count: int) -> None:
+    if not 1 <= count <= 100:
+        raise UsageError(f"{count} is not between 1 and 100", field="--seeds")
+
+
 @contextmanager
 def _running(
-    args: argparse.Namespace,
-    manifest: MethodManifest,
-    settings: EvaluationSettings,
-    out: Path,
-    sealed: SealedPart | None = None,
+    args: argparse.Namespace, calls: Sequence[Call], sealed: SealedPart | None = None
 ) -> Iterator[tuple[list[Path], JobsView | None, dict[str, Any]]]:
-    """Check a call, then give captures, a view of the jobs, and the options of what runs them.
+    """Check calls, then give captures, a view of the jobs, and the options of what runs them.
 
-    Whatever is wrong with the call is reported before a suite is rendered for it.
+    Whatever is wrong with a call is reported before a suite is rendered for it.
     """
     from hwp_bench.evaluation.evaluate import check_call, check_results_place, check_suite
     from hwp_bench.run.engine.options import engine_for, needs_of
@@ -141,12 +210,15 @@ def _running(
     splits = splits_of(args) if sealed is None else sealed.splits
     folder = getattr(args, "sealed", None)
     inputs = {"--capture": args.capture, "--sealed": folder, "--splits": args.splits}
-    check_results_place(manifest, out, inputs)
-    check_call(manifest, settings, out, "--set", overwrite=args.overwrite)
-    # Whether the method is still to be made once before the first capture.
-    rehearse = args.engine == "local"
+    for manifest, settings, out in calls:
+        check_results_place(manifest, out, inputs)
+        check_call(manifest, settings, out, "--set", overwrite=args.overwrite)
+    # Whether the methods are still to be made once before the first capture.
+    rehearse = local = args.engine == "local"
     if not args.capture and not folder:
-        rehearse = rehearse and not check_suite(manifest, settings, out, splits, rehearse=rehearse)
+        # Seeds of one method are alike.
+        for call in {each.manifest.name: each for each in calls}.values():
+            rehearse = not check_suite(*call, splits, rehearse=local) and rehearse
     with engine_for(args) as engine:
         needs = needs_of(args)
         if sealed is not None:
@@ -202,14 +274,15 @@ def _notice_failures(folder: Path, results: Results, head: str = "") -> int:
 def _evaluation_settings(args: argparse.Namespace) -> EvaluationSettings:
     """Return the settings that `_add_evaluation` and `--seed` gave."""
     from hwp_bench.evaluation.capture_evaluation import EvaluationSettings
-    from hwp_bench.methods.contract import Budget, RunSettings
+    from hwp_bench.evaluation.evaluate import make_budget
+    from hwp_bench.methods.contract import RunSettings
     from hwp_bench.run.sandbox.confinement import Confinement
 
     for name in ("budget", "steps", "time_limit", "memory_limit"):
         value = getattr(args, name)
         if value is not None and not 0 < value < float("inf"):
             raise UsageError(f"{value} is not above 0", field=f"--{name.replace('_', '-')}")
-    budget = Budget(args.budget, args.steps)
+    budget = make_budget(args.budget, args.steps)
     return EvaluationSettings(
         suite="captures" if args.capture else args.suite,
         preset=args.preset,
@@ -276,8 +349,7 @@ def _ablate(args: argparse.Namespace) -> int:
     from hwp_bench.evaluation.ablate.runs import make_design, run_ablation
     from hwp_bench.methods.manifest import check_settings, find_method, read_manifest
 
-    if not 1 <= args.seeds <= 100:
-        raise UsageError(f"{args.seeds} is not between 1 and 100", field="--seeds")
+    _check_seeds(args.seeds)
     args.seed = 0
     settings = _evaluation_settings(args)
     # A wrong method, setting or switch must be reported before a suite is rendered for it.
@@ -287,7 +359,7 @@ def _ablate(args: argparse.Namespace) -> int:
     based = f"-{args.base}" if args.base else ""
     out = Path(args.out or f"runs/ablation-{manifest.name}-{settings.suite}{based}")
     seeds = range(args.seeds)
-    with _running(args, manifest, settings, out) as (captures, jobs, options):
+    with _running(args, [Call(manifest, settings, out)]) as (captures, jobs, options):
         names = ", ".join(variant.name for variant in design.variants)
         notice(f"{len(design.variants)} variants: {names}")
         options["on_job"] = jobs.turn if jobs else None
@@ -380,7 +452,7 @@ def _budget(args: argparse.Namespace) -> int:
     truths = tuple(ORACLE_INPUTS) if args.truths is None else args.truths
     check_oracle_inputs(truths, settings)
     out = Path(args.out or f"runs/budget-{manifest.name}-{settings.suite}")
-    with _running(args, manifest, settings, out) as (captures, jobs, options):
+    with _running(args, [Call(manifest, settings, out)]) as (captures, jobs, options):
 
         def on_run(index: int, count: int, name: str) -> OnCapture | None:
             notice(f"{index + 1} of {count}: {name}")

@@ -24,6 +24,7 @@ _EXAMPLES = """examples:
   hwp-bench leaderboard show                                      # the board on the terminal
   hwp-bench leaderboard check
   hwp-bench leaderboard confirm runs/mine-mini --by maintainers   # score again, or a second run
+  hwp-bench leaderboard contest mine-mini-seed0-0123abcd runs/again --by me --reason "4 dB lower"
   hwp-bench leaderboard build -o site
   hwp-bench leaderboard build -o site --with runs/mine-mini       # reports with images
 
@@ -91,6 +92,18 @@ makes it `re-run` where the macro mean of PSNR is the same within the tolerance.
 reproduces; 1: it differs (the check says so too); 2: no entry fits.
 """
 
+_CONTEST = """examples:
+  hwp-bench leaderboard contest mine-mini-seed0-0123abcd runs/again --by "B. Person" \\
+      --reason "the same call gives 4 dB less"
+  hwp-bench leaderboard contest mine-mini-seed0-0123abcd 89abcdef --withdraw rerun \\
+      --by maintainers --reason "it ran without its weights"
+
+RERUN is another run of the entry's method with the same settings, seed, budget and data. It is
+written whole into a file next to the entry, with both digests, and the row shows the lower score
+until one of the two is withdrawn: a withdrawn entry leaves the board, a withdrawn rerun counts no
+more. Both stay in the folder and on the method's page.
+"""
+
 #: Longest text that an entry holds, characters.
 _LINE = 1000
 
@@ -105,11 +118,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     check = action("check", text, _check, _CHECK)
     show = action("show", "print the board: ranks with intervals, levels, badges", _show, _SHOW)
     confirm = action("confirm", "score an entry again, or compare a second run", _confirm, _CONFIRM)
+    text = "put a re-evaluation next to an entry, or withdraw one of them"
+    against = action("contest", text, _contest, _CONTEST)
     text = "allow entries the names of methods that ship"
     register = action("register", text, _register, _REGISTER)
     build = action("build", "write the static site", _build, _BUILD)
     text = "folder of the entries (default leaderboard/entries)"
-    for one in (add, submit, check, show, confirm, register, build):
+    for one in (add, submit, check, show, confirm, against, register, build):
         one.add_argument("--entries", metavar="DIR", help=text)
     text = "results folder or results.json"
     for taking in (add, submit):
@@ -121,6 +136,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     show.add_argument("--suite", metavar="NAME", help="only the tables of this suite")
     add_json(show, "print the tables as JSON")
     _add_confirm(confirm)
+    against.add_argument("entry", metavar="ENTRY", help="name of the entry")
+    text = "results of the other run; with --withdraw the first 8 digits of its digest"
+    against.add_argument("rerun", metavar="RERUN", help=text)
+    against.add_argument("--by", required=True, metavar="NAME", help="who contests or withdraws")
+    against.add_argument("--reason", required=True, metavar="TEXT", help="why")
+    text = "settle the contest: take one of the two out"
+    against.add_argument("--withdraw", choices=("entry", "rerun"), default="", help=text)
     register.add_argument("names", nargs="+", metavar="ENTRY", help="name of an entry")
     build.add_argument("-o", "--out", required=True, metavar="DIR", help="folder of the site")
     text = "results folders of entries, for the images of their reports"
@@ -300,6 +322,31 @@ def _confirm(args: argparse.Namespace, folder: Path) -> int:
         print(f"  second run {check.rerun[:8]}: PSNR {check.scores['psnr']:.2f} dB (macro mean)")
         print(f"  captures with the same predictions: {check.same_predictions}")
     return 0 if check.verdict == "reproduces" else 1
+
+
+def _contest(args: argparse.Namespace, folder: Path) -> int:
+    from hwp_bench.leaderboard.entries import refuse_installed, write_check
+    from hwp_bench.leaderboard.rules import check_source, sound_entries
+    from hwp_bench.leaderboard.submit import contest
+    from hwp_bench.results import result_files
+
+    _check_line("--by", args.by)
+    _check_line("--reason", args.reason)
+    refuse_installed(folder)
+    _refuse_none(folder)
+    fitting = [entry for entry in sound_entries(folder) if entry.name == args.entry]
+    if not fitting:
+        raise UsageError("is not a sound entry", where=folder, field=args.entry)
+    rerun: Path | str = args.rerun
+    if not args.withdraw:
+        (rerun,) = result_files(args.rerun)
+        check_source(rerun)
+    made = contest(fitting[0], rerun, by=args.by, reason=args.reason, withdraws=args.withdraw)
+    notice(f"{made.kind}: {write_check(folder, made)}")
+    if made.results:
+        own, other = (run.scores["psnr"] for run in (fitting[0].results, made.results))
+        print(f"{args.entry}: PSNR {own:.2f} dB, contested by {made.rerun[:8]}: {other:.2f} dB")
+    return 0
 
 
 def _register(args: argparse.Namespace, folder: Path) -> int:

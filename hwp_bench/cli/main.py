@@ -36,6 +36,7 @@ def command_tree() -> Command:
         ),
         "track": Command("track the hands of a video", f"{here}.data:track"),
         "inputs": Command("write the inputs of a program of your own", f"{here}.data:inputs"),
+        "card": Command("print the data card of a suite", f"{here}.data:card"),
         "publish": Command(
             "divide captures into a public and a sealed part", f"{here}.data:publish"
         ),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from hwp_bench.base.console import notice
@@ -80,13 +81,20 @@ def _methods() -> Table:
             ", ".join(method.switches) or "-",
             method.authors or "-",
             method.licence or "-",
+            _validation(method.validation),
             method.url or "-",
             method.description,
         )
         for method in shipped_methods()
     ]
-    titles = "method, title, presets, switches, authors, licence, url, description"
+    titles = (
+        "method, title, presets, switches, authors, licence, validation frames, url, description"
+    )
     return named_table("Methods that ship with the toolkit", titles, rows)
+
+
+def _validation(uses: Sequence[str] | None) -> str:
+    return "not declared" if uses is None else ", ".join(uses) or "none"
 
 
 def _metrics() -> Table:

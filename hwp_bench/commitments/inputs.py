@@ -72,7 +72,10 @@ def check_name(name: str) -> None:
 def _manifest(name: str) -> str:
     text = json.dumps(name)
     return (
-        f'schema = "{METHOD_SCHEMA}"\nname = {text}\ntitle = {text}\ndescription = ""\n\n'
+        f'schema = "{METHOD_SCHEMA}"\nname = {text}\ntitle = {text}\ndescription = ""\n'
+        "# What the program was trained on before it saw a capture: if anything, a table\n"
+        "# [training] with `simulated`, `public` or `private` (docs/methods.md).\n"
+        'training = "none"\n\n'
         f'[entry]\npredictions = "{PREDICTIONS}"\n'
     )
 

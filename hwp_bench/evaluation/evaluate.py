@@ -7,6 +7,7 @@ Whatever is wrong with a call is said before a suite is rendered for minutes (`c
 from __future__ import annotations
 
 import datetime
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -30,7 +31,7 @@ from hwp_bench.evaluation.results_folder import (
     refuse_other,
 )
 from hwp_bench.methods.contents import digest_of, method_files, refuse_links_out
-from hwp_bench.methods.contract import FRAME_CHOICES
+from hwp_bench.methods.contract import FRAME_CHOICES, Budget
 from hwp_bench.methods.manifest import (
     DEFAULT_PRESET,
     MethodManifest,
@@ -50,6 +51,8 @@ from hwp_bench.suites.suite import SuiteCapture, is_ready, suite
 
 #: Most seconds that a method may take to be made before the first capture.
 REHEARSAL_SECONDS = 600.0
+# Steps that no fit of two minutes takes on the hardware of today.
+_LIFTED = 100_000
 #: Called when a capture's work begins, with (index, count, capture id); returns a function that is
 #: then called with (done, total) steps.
 OnCapture = Callable[[int, int, str], Callable[[int, int], None] | None]
@@ -68,16 +71,29 @@ class How(TypedDict, total=False):
     rehearse: bool
 
 
+def make_budget(seconds: float | None, steps: int | None) -> Budget:
+    """Return the budget that a person asks for; seconds alone lift the method's limit of steps.
+
+    They stand next to more steps than a fit takes in that time, 1,000 a second and at least
+    100,000, so that a result says what it was made with.
+    """
+    asked = Budget(seconds, steps)
+    if asked.seconds is None or asked.steps is not None:
+        return asked
+    return replace(asked, steps=max(_LIFTED, math.ceil(1_000 * asked.seconds)))
+
+
 def default_folder(method: str, settings: EvaluationSettings) -> Path:
     """Return the results folder of an evaluation that names none.
 
     Oracles, budgets and seeds other than 0 have folders of their own.
     """
     run = settings.run
+    lifted = run.budget == make_budget(run.budget.seconds, None)
     parts = [Path(method).name or Path(method).resolve().name, settings.suite]
     parts += [] if run.frames == FRAME_CHOICES[0] else [run.frames]
     parts += [] if run.budget.seconds is None else [f"{run.budget.seconds:g}s"]
-    parts += [] if run.budget.steps is None else [f"{run.budget.steps}steps"]
+    parts += [] if run.budget.steps is None or lifted else [f"{run.budget.steps}steps"]
     parts += [] if run.seed == 0 else [f"seed{run.seed}"]
     return Path("runs") / "-".join(parts)
 
@@ -124,6 +140,7 @@ def run_plans(
             if evaluation.capture.lacks_masks:
                 name = evaluation.capture.info.id
                 notice(f"{name}: its true masks are not there: scored on its estimated masks")
+        _warn_of_training(next(iter(plans.values())))
         folders = {
             name: open_results_folder(
                 out / name,
@@ -164,6 +181,17 @@ def run_plans(
         results = {name: record(name) for name in plans}
         finish_together([(folders[name], results[name]) for name in plans], tables=tables)
         return results
+
+
+def _warn_of_training(plan: Plan) -> None:
+    """Say which captures a method learnt from before, as it declares itself."""
+    infos = [evaluation.capture.info for evaluation in plan.evaluations]
+    scenes = {info.id: str(info.source.get("scene_digest") or info.origin) for info in infos}
+    if shared := plan.manifest.training.shared(scenes):
+        notice(
+            f"warning: {plan.manifest.name} declares that it was trained on {', '.join(shared)}, "
+            "on which it is scored now: the leaderboard refuses such results"
+        )
 
 
 def with_setting_files(
@@ -210,7 +238,13 @@ class Plan:
         name, title, run = self.manifest.name, one_line(self.manifest.title), self.settings.run
         return Results(
             method=MethodId(
-                name, title, self.digest, self.settings.preset or DEFAULT_PRESET, dict(run.settings)
+                name,
+                title,
+                self.digest,
+                self.settings.preset or DEFAULT_PRESET,
+                dict(run.settings),
+                self.manifest.training,
+                self.manifest.validation,
             ),
             suite=self.settings.suite,
             seed=run.seed,

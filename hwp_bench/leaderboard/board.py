@@ -8,24 +8,23 @@ from functools import cached_property
 from typing import Any
 
 from hwp_bench.analysis.columns import Filled, score_column, table_of
-from hwp_bench.analysis.compare import Rank, compare, rank_methods, verdict
-from hwp_bench.analysis.pairing import MACRO, group_runs, same_but_seed, scope_scores
-from hwp_bench.base.errors import UsageError
+from hwp_bench.analysis.compare import Rank, rank_methods, verdict
+from hwp_bench.analysis.pairing import group_runs, same_but_seed, scope_scores
 from hwp_bench.base.tables import Column, Table
 from hwp_bench.leaderboard.entries import BADGES, LEVELS, Entry
 from hwp_bench.leaderboard.rules import HEADLINE, current, source_of, tables_of, takes_over
 from hwp_bench.leaderboard.suite_data import Severities, on_current_data, suite_severities
 from hwp_bench.metrics import HWP_V1
-from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.metrics.score import CaptureScores
 from hwp_bench.report.study_tables import METRIC
 from hwp_bench.results import CaptureResult, Results
-from hwp_bench.results.schema import score_rows
+from hwp_bench.results.schema import TRAINING_KINDS, score_rows
 from hwp_bench.suites.suite import find_missing
 from hwp_bench.taxonomy import PERTURBATIONS, perturbation
 
 #: The badge of a row is the first of these that one of its entries has.
-_LEAST = ("differs", "disputed", *(b for b in BADGES if b not in ("differs", "disputed")))
+_WORST = ("contested", "differs", "disputed")
+_LEAST = (*_WORST, *(badge for badge in BADGES if badge not in _WORST))
 
 
 @dataclass(frozen=True)
@@ -52,17 +51,17 @@ class BoardRow:
     @property
     def first(self) -> Results:
         """The results of the lowest seed."""
-        return self.entries[0].results
+        return self.entries[0].counted
 
     @property
     def compared(self) -> list[Results]:
         """The results of every seed, as they are compared with other rows."""
-        return [on_current_data(entry.results) for entry in self.entries]
+        return [on_current_data(entry.counted) for entry in self.entries]
 
     @property
     def captures(self) -> list[CaptureResult]:
         """The captures of every seed."""
-        return [capture for entry in self.entries for capture in entry.results.captures]
+        return [capture for entry in self.entries for capture in entry.counted.captures]
 
     @property
     def seeds(self) -> tuple[int, ...]:
@@ -80,6 +79,16 @@ class BoardRow:
         return budget_text(self.first.budget)
 
     @property
+    def training(self) -> tuple[str, ...]:
+        """Kinds of data that it was trained on before, of `TRAINING_KINDS`."""
+        return self.first.method.training.kinds
+
+    @property
+    def training_text(self) -> str:
+        """These kinds in words."""
+        return ", ".join(TRAINING_KINDS[kind] for kind in self.training)
+
+    @property
     def date(self) -> str:
         """Day of the latest evaluation, ISO 8601."""
         return max(entry.results.started for entry in self.entries)[:10]
@@ -92,7 +101,7 @@ class BoardRow:
     @property
     def scores(self) -> Mapping[str, float]:
         """Headline scores by metric, means over the seeds."""
-        found = [entry.results.scores for entry in self.entries]
+        found = [entry.counted.scores for entry in self.entries]
         return {name: sum(one[name] for one in found) / len(found) for name in found[0]}
 
     @cached_property
@@ -129,6 +138,8 @@ class BoardRow:
 
     def why_older(self, entry: Entry) -> str:
         """Say in a few words why one of its older entries is not the row."""
+        if withdrawal := entry.withdrawal("entry"):
+            return f"withdrawn by {withdrawal.by}: {withdrawal.reason}"
         known = [*self.entries, *self.older]
         for other in known:
             if other.submission.revises == entry.name and takes_over(other, entry):
@@ -161,11 +172,13 @@ def board_rows(entries: Iterable[Entry]) -> list[BoardRow]:
 def method_rows(entries: Sequence[Entry]) -> list[BoardRow]:
     """Return one row for each method, in the order in which the methods come.
 
-    The row of a method is whole where one is, checked as far as one is, and of these the newest.
+    A method whose entries were all withdrawn has none. The row of a method is whole where one is,
+    checked as far as one is, and of these the newest.
     """
     methods: dict[object, list[Entry]] = {}
     for entry in entries:
         methods.setdefault(source_of(entry), []).append(entry)
+    methods = {source: own for source, own in methods.items() if current(own)}
     chosen = [max(board_rows(current(own)), key=_standing) for own in methods.values()]
     return [
         replace(row, label=label, older=_older(row, own))
@@ -226,7 +239,7 @@ SEVERITIES = (1, 2, 3, 4, 5)
 
 def _scopes(entry: Entry) -> dict[str, Mapping[str, float]]:
     """Means of the metrics of an entry by scope; an empty one where it has no such capture."""
-    captures = score_rows(entry.results)
+    captures = score_rows(entry.counted)
     found: dict[str, Mapping[str, float]] = {scope: {} for scope in SCOPES}
     found |= scope_scores(captures)
     severities = suite_severities(entry.results.suite)
@@ -249,9 +262,9 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 
 def budget_text(budget: Mapping[str, Any]) -> str:
-    """Return a budget in words: `60 s`, `500 steps`, `60 s, 500 steps` or `no limit`."""
+    """Return a budget in words: `60 s`, `60 s, 100,000 steps` or `no limit`."""
     units = {"seconds": "s", "steps": "steps"}
-    parts = [f"{budget[name]:g} {unit}" for name, unit in units.items() if budget.get(name)]
+    parts = [f"{budget[name]:,g} {unit}" for name, unit in units.items() if budget.get(name)]
     return ", ".join(parts) or "no limit"
 
 
@@ -331,6 +344,7 @@ def _table(suite: str, protocol: str, entries: Sequence[Entry]) -> Table:
         *((score_column(name), [row.scores[name] for row in order]) for name in HEADLINE),
         (Column("Fit [s]", 1), [row.fit_seconds for row in order]),
         (Column("Seeds", 0), [len(row.seeds) for row in order]),
+        (Column("Training data"), [row.training_text for row in order]),
         (Column("Level"), [row.level for row in order]),
         (Column("Badge"), [row.badge for row in order]),
         (Column("Entry"), [row.name + text for row, text in zip(order, more, strict=True)]),
@@ -363,44 +377,6 @@ def ranks_of(rows: Sequence[BoardRow]) -> tuple[dict[str, Rank], str]:
     # What is compared is made again for each row, so that a run tells which row it is of.
     run_of = {id(one): run.label for run in runs for one in run.seeds.values()}
     found = {name: by_label[run_of[id(own[0])]] for name, own in compared.items()}
-    return found, f"{verdict(ranking)} {left_out}".rstrip()
-
-
-#: The method that every other one is measured against.
-REFERENCE = "wildghand"
-
-
-def reference_lead(rows: Sequence[BoardRow]) -> str:
-    """Return one sentence: the reference against the best competitor with the same budget.
-
-    Where the reference has rows of several budgets, the one with most competitors speaks. Rows
-    that lack a part of the suite do not take part. The sentence is empty where nobody has the
-    budget of the reference, or no seed in common with it.
-    """
-    whole = [row for row in rows if row.whole]
-    mine = [row for row in whole if row.first.method.name == REFERENCE]
-    others = [row for row in whole if row.first.method.name != REFERENCE]
-    pairs = [(row, [one for one in others if one.first.budget == row.first.budget]) for row in mine]
-    reference, competitors = max(
-        pairs, key=lambda pair: (len(pair[1]), pair[0].scores[METRIC]), default=(None, [])
-    )
-    if reference is None or not competitors:
-        return ""
-    best = max(competitors, key=lambda row: row.scores[METRIC])
-    results = [one for row in (reference, best) for one in row.compared]
-    try:
-        (found,) = compare(group_runs(results), METRIC, scope=MACRO)
-    except UsageError:
-        return ""
-    lead = found.estimate
-    facts = metric_facts(METRIC)
-    where = "ahead of" if lead.value >= 0.0 else "behind"
-    text = (
-        f"{reference.first.method.title} is {abs(lead.value):.{facts.digits}f} {facts.unit} "
-        f"{where} {best.first.method.title}, the best other method "
-        f"with the same budget on {reference.first.suite}"
-    )
-    if lead.low is None or lead.high is None:
-        return f"{text}; nothing says how sure that is."
-    text += f" (95 % interval {lead.low:+.{facts.digits}f} to {lead.high:+.{facts.digits}f}"
-    return text + ("; not significant)." if lead.low <= 0.0 <= lead.high else ").")
+    budgets = list(dict.fromkeys(row.budget for row in ranked))
+    unequal = f"Budgets differ: {'; '.join(budgets)}." if budgets[1:] else ""
+    return found, " ".join(filter(None, (verdict(ranking), unequal, left_out)))

@@ -22,14 +22,10 @@ from hwp_bench.results.schema import MAX_CAPTURES, ScoreTable, check_scores
 ENTRY_SCHEMA = "hwp-leaderboard-entry/1"
 #: Version of the check files.
 CHECK_SCHEMA = "hwp-leaderboard-check/1"
+#: Version of the files of contests.
+CONTEST_SCHEMA = "hwp-leaderboard-contest/1"
 #: How far a row was checked, the least first.
 LEVELS = ("self-reported", "rescored", "re-run")
-#: What the levels mean, in words for people.
-LEVEL_TEXTS = {
-    "self-reported": "the submitter's own numbers; form and digests are sound",
-    "rescored": "every score was computed again from the stored predictions",
-    "re-run": "the method was run again, and its score came out the same",
-}
 #: What a reproducibility badge can say, and what it means.
 BADGES = {
     "not tried": "nobody has checked this row yet",
@@ -37,6 +33,7 @@ BADGES = {
     "reproduces": "a second run of the method had the same score within the tolerance",
     "differs": "a check found other numbers than the row has",
     "disputed": "its checks contradict each other; the one that differs counts",
+    "contested": "a re-evaluation stands against it; the lower score counts until that is settled",
 }
 #: What a link of a submission can lead to.
 LINKS = ("code", "paper", "predictions", "avatars")
@@ -144,6 +141,45 @@ class Check:
         return sha256_json(self.content)
 
 
+@dataclass(frozen=True)
+class Contest:
+    """A re-evaluation that somebody puts next to an entry, or the withdrawal of one of the two."""
+
+    #: Name of the entry, and the digest in its file.
+    entry: Line
+    entry_digest: Digest
+    #: Digest of the re-evaluation's results.
+    rerun: Digest
+    #: When, ISO 8601, UTC.
+    date: Moment
+    #: Who contests or withdraws, and why.
+    by: Annotated[Line, Meta(min_length=1)]
+    reason: Annotated[Line, Meta(min_length=1)]
+    #: The re-evaluation; None in a withdrawal.
+    results: Results | None = None
+    #: What is withdrawn, which settles the contest; None in the contest itself.
+    withdraws: Literal["entry", "rerun"] | None = None
+
+    def __post_init__(self) -> None:
+        if (self.results is None) == (self.withdraws is None):
+            raise UsageError("must have exactly one of results and withdraws", field="results")
+
+    @property
+    def content(self) -> dict[str, Any]:
+        """Its fields as its file holds them."""
+        return asdict(self)
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 (hex) of its content."""
+        return sha256_json(self.content)
+
+    @property
+    def kind(self) -> str:
+        """What its file is called after."""
+        return "contest" if self.withdraws is None else "withdrawal"
+
+
 def _without(fields: dict[str, Any], *names: str) -> dict[str, Any]:
     return {name: value for name, value in fields.items() if name not in names}
 
@@ -192,10 +228,10 @@ def badge(checks: Iterable[Check]) -> str:
     ]
 
 
-#: Largest entry that is read, bytes: the full suite takes about 1 MB.
+#: Largest entry or contest that is read, bytes: the full suite takes about 1 MB.
 MAX_ENTRY_BYTES = 16 * 1024 * 1024
-#: Folder of checks, inside that of the entries.
-CHECKS = "checks"
+#: Folders of checks and of contests, inside that of the entries.
+CHECKS, CONTESTS = "checks", "contests"
 
 
 @dataclass(frozen=True)
@@ -212,16 +248,45 @@ class Entry:
     digest: str = ""
     #: Its checks.
     checks: tuple[Check, ...] = ()
+    #: Re-evaluations that stand next to it, and withdrawals.
+    contests: tuple[Contest, ...] = ()
 
     @property
     def level(self) -> str:
-        """How far it was checked, one of `records.LEVELS`."""
+        """How far it was checked, one of `LEVELS`."""
         return level(self.checks)
 
     @property
     def badge(self) -> str:
-        """Its reproducibility badge, one of `records.BADGES`."""
-        return badge(self.checks)
+        """Its reproducibility badge, one of `BADGES`."""
+        return "contested" if self.open_contests else badge(self.checks)
+
+    @property
+    def additions(self) -> list[Check | Contest]:
+        """Its checks and contests."""
+        return [*self.checks, *self.contests]
+
+    def withdrawal(self, kind: str, rerun: str | None = None) -> Contest | None:
+        """Return what withdraws the entry, or one of the re-evaluations that contest it."""
+        fitting = [one for one in self.contests if rerun in (None, one.rerun)]
+        return next((one for one in fitting if one.withdraws == kind), None)
+
+    @property
+    def open_contests(self) -> list[Contest]:
+        """The contests that are not settled: neither the entry nor the other run is withdrawn."""
+        if self.withdrawal("entry"):
+            return []
+        return [one for one in self.contests if one.results and not self.settled(one)]
+
+    def settled(self, contest: Contest) -> Contest | None:
+        """Return what settled a contest of the entry; None where it is open."""
+        return self.withdrawal("entry") or self.withdrawal("rerun", contest.rerun)
+
+    @property
+    def counted(self) -> Results:
+        """The results that the board shows: while it is contested, those with the lower PSNR."""
+        others = [one.results for one in self.open_contests if one.results]
+        return min([self.results, *others], key=lambda results: results.scores["psnr"])
 
     @property
     def protocol(self) -> str:
@@ -250,6 +315,14 @@ class _CheckFile:
 
     digest: str
     check: Check
+
+
+@dataclass(frozen=True)
+class _ContestFile:
+    """The content of a contest's file, next to its `schema`."""
+
+    digest: str
+    contest: Contest
 
 
 def entry_name(results: Results, content: str | None = None) -> str:
@@ -313,19 +386,23 @@ def refuse_installed(folder: Path) -> None:
 
 
 def read_entries(folder: Path, on_fault: Callable[[HwpError], None] | None = None) -> list[Entry]:
-    """Read every entry of a folder with its checks, by name.
+    """Read every entry of a folder with its checks and contests, by name.
 
-    A damaged file, and a check of an entry or content that is not there, is refused. With
-    `on_fault` they are left out, and it is called with what is wrong with a file.
+    A damaged file, and a check or contest of an entry or content that is not there, is refused.
+    With `on_fault` they are left out, and it is called with what is wrong with a file.
     """
     checks = _read_all(sorted((folder / CHECKS).glob("*.json")), _read_check, on_fault)
-    entries = _read_all(entry_files(folder), lambda file: read_entry(file, checks), on_fault)
+    contests = _read_all(sorted((folder / CONTESTS).glob("*.json")), _read_contest, on_fault)
+    entries = _read_all(
+        entry_files(folder), lambda file: read_entry(file, checks, contests), on_fault
+    )
     known = {(entry.name, entry.digest) for entry in entries}
-    for check in checks if on_fault is None else ():
-        if (check.entry, check.entry_digest) not in known:
+    others: list[Check | Contest] = [*checks, *contests]
+    for other in others if on_fault is None else ():
+        if (other.entry, other.entry_digest) not in known:
             raise BadResult(
-                f"is of {check.entry} with digest {check.entry_digest[:8]}, which is not there",
-                where=folder / CHECKS / f"{check_name(check)}.json",
+                f"is of {other.entry} with digest {other.entry_digest[:8]}, which is not there",
+                where=_file_next_to(folder, other),
                 field="entry",
             )
     return entries
@@ -350,8 +427,8 @@ def entry_files(folder: Path) -> list[Path]:
     return sorted(folder.glob("*.json")) if folder.is_dir() else []
 
 
-def read_entry(file: Path, checks: Sequence[Check]) -> Entry:
-    """Read one entry."""
+def read_entry(file: Path, checks: Sequence[Check], contests: Sequence[Contest] = ()) -> Entry:
+    """Read one entry; its checks and contests are those among the given ones that name it."""
     value = without_schema(read_json(file, max_bytes=MAX_ENTRY_BYTES), ENTRY_SCHEMA, where=file)
     entry = parse_record(_File, value, where=file)
     results = entry.results
@@ -366,31 +443,54 @@ def read_entry(file: Path, checks: Sequence[Check]) -> Entry:
         )
     if file.stem != entry_name(results, content):
         raise BadResult(f"must be called {entry_name(results, content)}.json", where=file)
-    own = tuple(c for c in checks if (c.entry, c.entry_digest) == (file.stem, content))
-    return Entry(file.stem, results, entry.submission or Submission(), content, own)
+    own, against = (
+        tuple(one for one in found if (one.entry, one.entry_digest) == (file.stem, content))
+        for found in (checks, contests)
+    )
+    added = entry.submission or Submission()
+    return Entry(file.stem, results, added, content, own, against)  # type: ignore[arg-type]
 
 
-def check_name(check: Check) -> str:
-    """Return the name of a check's file: its entry, its kind, and part of its digest."""
-    return f"{check.entry}.{check.kind}-{check.digest[:8]}"
+def _file_next_to(folder: Path, other: Check | Contest) -> Path:
+    """Return the file of a check or contest: its entry, its kind, and part of its digest."""
+    place = CHECKS if isinstance(other, Check) else CONTESTS
+    return folder / place / f"{other.entry}.{other.kind}-{other.digest[:8]}.json"
 
 
-def write_check(folder: Path, check: Check) -> Path:
-    """Write a check below a folder of entries; returns its file."""
+def write_check(folder: Path, other: Check | Contest) -> Path:
+    """Write a check or contest below a folder of entries; returns its file."""
     refuse_installed(folder)
-    value = {"digest": check.digest, "check": check.content}
-    text = json.dumps({"schema": CHECK_SCHEMA, **value}, indent=1, allow_nan=False)
-    return atomic_write(folder / CHECKS / f"{check_name(check)}.json", text + "\n")
+    name, schema = "check", CHECK_SCHEMA
+    if isinstance(other, Contest):
+        name, schema = "contest", CONTEST_SCHEMA
+    value = {"schema": schema, "digest": other.digest, name: other.content}
+    text = json.dumps(value, indent=None if name == "contest" else 1, allow_nan=False)
+    return atomic_write(_file_next_to(folder, other), text + "\n")
 
 
 def _read_check(file: Path) -> Check:
     value = without_schema(read_json(file), CHECK_SCHEMA, where=file)
     content = parse_record(_CheckFile, value, where=file)
     if content.digest != sha256_json(value["check"]):
-        raise BadResult(
-            "is not the digest of the content: the check was changed by hand",
-            where=file,
-            field="digest",
-            remedy="Check again with `hwp-bench leaderboard confirm`.",
-        )
+        raise _changed(file, "check", "Check again with `hwp-bench leaderboard confirm`.")
     return content.check
+
+
+def _read_contest(file: Path) -> Contest:
+    value = without_schema(read_json(file, max_bytes=MAX_ENTRY_BYTES), CONTEST_SCHEMA, where=file)
+    content = parse_record(_ContestFile, value, where=file)
+    given = value["contest"]
+    if content.digest != sha256_json(given):
+        raise _changed(file, "contest", "Contest again with `hwp-bench leaderboard contest`.")
+    if given.get("results") is not None and sha256_json(given["results"]) != given["rerun"]:
+        raise BadResult("is not the digest of its results", where=file, field="contest.rerun")
+    return content.contest
+
+
+def _changed(file: Path, what: str, remedy: str) -> BadResult:
+    return BadResult(
+        f"is not the digest of the content: the {what} was changed by hand",
+        where=file,
+        field="digest",
+        remedy=remedy,
+    )

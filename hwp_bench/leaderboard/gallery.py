@@ -1,4 +1,4 @@
-"""The gallery of the site: what each method draws of a few test frames, and how far it is off."""
+"""The pictures of the site: what methods draw of test frames, and how far they are off."""
 
 from __future__ import annotations
 
@@ -63,6 +63,34 @@ def write_gallery(
     return scenes
 
 
+def write_extremes(
+    folder: Path,
+    sources: Sequence[tuple[Entry, ResultsSource]],
+    captures: Mapping[str, Capture],
+) -> dict[str, list[dict[str, Any]]]:
+    """Draw the best and the worst test frame of every capture, by PSNR, for each entry by its name.
+
+    Each item is one capture: `capture`, and `best` and `worst` with `frame`, `truth` and what a
+    shot of `write_gallery` has. Frames that failed have no picture and are left out.
+    """
+    found: dict[str, list[dict[str, Any]]] = {}
+    for entry, source in sources:
+        for result in source.results.captures:
+            capture = captures.get(result.digest)
+            drawn = [frame for frame in result.frames if frame.failure is None]
+            if capture is None or not drawn:
+                continue
+            order = sorted(drawn, key=lambda frame: (-frame.scores["psnr"], frame.frame))
+            pair: dict[str, Any] = {"capture": capture.info.id}
+            for name, frame in (("best", order[0].frame), ("worst", order[-1].frame)):
+                truth = _Truth(folder, capture, frame)
+                if shot := truth.shot(entry, source, result):
+                    pair[name] = {**shot, "frame": frame, "truth": truth.address}
+            if {"best", "worst"} <= pair.keys():
+                found.setdefault(entry.name, []).append(pair)
+    return found
+
+
 def _scenes(
     folder: Path,
     capture: Capture,
@@ -71,36 +99,59 @@ def _scenes(
     titles: Mapping[str, str],
 ) -> list[dict[str, Any]]:
     common = sorted(set.intersection(*({item.frame for item in row.frames} for _, _, row in found)))
-    # The name of a folder is made of a digest: a capture's own id comes from outside.
-    place = f"pictures/{sha256_json(capture.info.to_json())[:12]}"
-    (folder / place).mkdir(parents=True, exist_ok=True)
     scenes = []
     for frame in (common[index] for index in evenly(len(common), FRAMES)):
-        target = capture.frame(frame)
-        mask, exact = capture.scoring_mask(frame)
-        region = scored_pixels(mask, erosion=HWP_V1.mask_erosion, coverage=exact)
-        box = square_around(region)
-        truth = f"{place}/{frame}-truth.jpg"
-        _write(folder / truth, np.where(region[..., None], target, 0)[box])
+        truth = _Truth(folder, capture, frame)
         shots = []
         for entry, source, result in found:
-            predictions = source.place(result.id, "predictions")
-            if predictions is None:
-                continue
-            pixels = read_prediction(predictions, frame, capture.size).pixels
-            if pixels is None:
-                continue
-            own = f"{place}/{frame}-{digest(entry.results)[:12]}"
-            picture, error = f"{own}.jpg", f"{own}-e.jpg"
-            _write(folder / picture, np.where(region[..., None], pixels, 0)[box])
-            _write(folder / error, error_map(pixels, target, region)[box])
-            psnr = next(item.scores["psnr"] for item in result.frames if item.frame == frame)
-            title = titles[entry.name]
-            shot = {"entry": entry.name, "title": title, "picture": picture, "error": error}
-            shots.append({**shot, "psnr": psnr})
+            if shot := truth.shot(entry, source, result):
+                shots.append({**shot, "title": titles[entry.name]})
         if shots:
-            scenes.append({"capture": name, "frame": frame, "truth": truth, "shots": shots})
+            scene = {"capture": name, "frame": frame, "truth": truth.address, "shots": shots}
+            scenes.append(scene)
     return scenes
+
+
+class _Truth:
+    """The truth of one frame in the site, next to which predictions of it are drawn."""
+
+    def __init__(self, folder: Path, capture: Capture, frame: int) -> None:
+        self.folder, self.frame, self.target = folder, frame, capture.frame(frame)
+        mask, exact = capture.scoring_mask(frame)
+        self.region = scored_pixels(mask, erosion=HWP_V1.mask_erosion, coverage=exact)
+        self.box = square_around(self.region)
+        # The name of a folder is made of a digest: a capture's own id comes from outside.
+        self.place = f"pictures/{sha256_json(capture.info.to_json())[:12]}"
+        self.address = self._draw(f"{frame}-truth", self.target)
+
+    def shot(
+        self, entry: Entry, source: ResultsSource, result: CaptureResult
+    ) -> dict[str, Any] | None:
+        """Draw what an entry predicts and its error; None where its pixels are not there."""
+        predictions = source.place(result.id, "predictions")
+        if predictions is None:
+            return None
+        height, width = self.target.shape[:2]
+        pixels = read_prediction(predictions, self.frame, (height, width)).pixels
+        if pixels is None:
+            return None
+        name = f"{self.frame}-{digest(entry.results)[:12]}"
+        error = error_map(pixels, self.target, self.region)
+        return {
+            "entry": entry.name,
+            "picture": self._draw(name, pixels),
+            "error": self._draw(f"{name}-e", error, masked=False),
+            "psnr": next(one.scores["psnr"] for one in result.frames if one.frame == self.frame),
+        }
+
+    def _draw(self, name: str, image: np.ndarray, *, masked: bool = True) -> str:
+        """Write a picture that is not there yet; returns its address within the site."""
+        address = f"{self.place}/{name}.jpg"
+        if not (self.folder / address).is_file():
+            shown = np.where(self.region[..., None], image, 0) if masked else image
+            (self.folder / self.place).mkdir(parents=True, exist_ok=True)
+            _write(self.folder / address, shown[self.box])
+        return address
 
 
 def _write(path: Path, image: np.ndarray) -> None:

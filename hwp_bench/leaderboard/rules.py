@@ -25,17 +25,19 @@ from hwp_bench.base.packages import data_folder
 from hwp_bench.base.records import Digest, Line, parse_record, without_schema
 from hwp_bench.evaluation.capture_evaluation import RESULT, key_of
 from hwp_bench.evaluation.verify import Discrepancy, copy_differences, digest_differences
-from hwp_bench.leaderboard.entries import LEVELS, Check, Entry, read_entries
+from hwp_bench.leaderboard.entries import LEVELS, Check, Contest, Entry, make_entry, read_entries
 from hwp_bench.leaderboard.suite_data import CaptureData, known_data, on_current_data, suite_origins
 from hwp_bench.methods.manifest import shipped_methods
 from hwp_bench.metrics import HWP_V1, PROTOCOLS, metric_names, penalty
 from hwp_bench.metrics.score import aggregate
-from hwp_bench.results.schema import MAX_BYTES, CaptureResult, score_rows
-from hwp_bench.suites.suite import find_missing, find_wrong_labels
+from hwp_bench.results import Results
+from hwp_bench.results.schema import MAX_BYTES, CaptureResult, TrainingData, score_rows
+from hwp_bench.suites.suite import find_missing, find_wrong_labels, suite_scenes
 from hwp_bench.taxonomy import SUITES as ALL_SUITES
 
-#: Suites whose captures are the same everywhere. `wild-dev` is for tuning.
-SUITES = tuple(name for name in ALL_SUITES if name != "wild-dev")
+#: Suites whose captures are the same everywhere, in the order of the board: first the one that
+#: nothing was tuned on. `wild-dev` is for tuning.
+SUITES = ("wild-test", *(name for name in ALL_SUITES if not name.startswith("wild-")))
 #: Metrics that every frame of an entry has.
 HEADLINE = ("psnr", "ssim", "oriented_distance")
 
@@ -56,19 +58,20 @@ def tables_of(entries: Iterable[Entry]) -> dict[tuple[str, str], list[Entry]]:
     found: dict[tuple[str, str], list[Entry]] = {}
     for entry in entries:
         found.setdefault(entry.table, []).append(entry)
-    order = sorted(found, key=lambda key: (ALL_SUITES.index(key[0]), key[1] != HWP_V1.name, key[1]))
+    order = sorted(found, key=lambda key: (SUITES.index(key[0]), key[1] != HWP_V1.name, key[1]))
     return {key: found[key] for key in order}
 
 
 def current(entries: Sequence[Entry]) -> list[Entry]:
-    """Return the entries that no other one takes the place of."""
+    """Return the entries that are not withdrawn and that no other one takes the place of."""
+    standing = [entry for entry in entries if not entry.withdrawal("entry")]
     replaced = {
         former.name
-        for entry in entries
+        for entry in standing
         for former in history(entry, entries)
         if takes_over(entry, former)
     }
-    return [entry for entry in entries if entry.name not in replaced]
+    return [entry for entry in standing if entry.name not in replaced]
 
 
 def takes_over(revision: Entry, revised: Entry) -> bool:
@@ -131,6 +134,13 @@ def _check_one(entry: Entry) -> None:
             where=entry.name,
             field="suite",
             remedy=f"The leaderboard takes results of --suite {', '.join(SUITES)}.",
+        )
+    if shared := results.method.training.shared(suite_scenes(results.suite)):
+        raise UsageError(
+            f"is of a method that was trained on {', '.join(shared)}, on which it is scored",
+            where=entry.name,
+            field="method.training",
+            remedy="Train without the suite's scenes; `wild-dev` and your own scenes are free.",
         )
     if results.frames != "perturbed":
         raise UsageError(
@@ -299,6 +309,15 @@ def check_names(entries: Iterable[Entry], listed: frozenset[str]) -> None:
     """Refuse an entry under the name or title of a method that ships, unless it is listed."""
     for entry in entries:
         name = _taken(entry)
+        method = entry.results.method
+        declared = _declared().get(method.digest, method.training)
+        if declared != method.training:
+            raise UsageError(
+                f"says that the training data are {method.training.text}; the method.toml of these "
+                f"files says {declared.text}",
+                where=entry.name,
+                field="method.training",
+            )
         if name is not None and entry.digest not in listed:
             raise UsageError(
                 f"carries the name of {name}, a method that ships with the toolkit",
@@ -307,6 +326,12 @@ def check_names(entries: Iterable[Entry], listed: frozenset[str]) -> None:
                 remedy="Give the method a name and title of its own in its method.toml. Rows of "
                 "methods that ship come from the maintainers (`hwp-bench leaderboard register`).",
             )
+
+
+@cache
+def _declared() -> dict[str, TrainingData]:
+    """The training data that methods that ship declare, by their digests."""
+    return {manifest.digest: manifest.training for manifest in shipped_methods()}
 
 
 @cache
@@ -374,6 +399,46 @@ def check_bound(entry: Entry) -> None:
     for check in entry.checks:
         _check_verdict(entry, check)
         _check_overruling(entry, check)
+    for contest in entry.contests:
+        check_contest(entry, contest)
+
+
+def repeats(first: Results, second: Results) -> bool:
+    """Return whether two runs are of the same method in the same state on the same data."""
+    if first.started == second.started:
+        return False
+    one, other = (
+        (
+            item.method,
+            item.suite,
+            item.seed,
+            item.budget,
+            item.frames,
+            sorted((c.id, c.digest, c.split_digest) for c in item.captures),
+        )
+        for item in (on_current_data(first), on_current_data(second))
+    )
+    return one == other
+
+
+def check_contest(entry: Entry, contest: Contest) -> None:
+    """Refuse a contest whose run is not of the entry or unsound, or a withdrawal of no contest."""
+    if contest.results is None:
+        if not any(other.results and other.rerun == contest.rerun for other in entry.contests):
+            problem = f"withdraws {contest.rerun[:8]}, which does not contest the entry"
+            raise _wrong(entry, "contests", problem)
+        return
+    if not repeats(entry.results, contest.results):
+        raise BadResult(
+            "is contested by a run of another method, settings, seed, budget or data, or by itself",
+            where=entry.name,
+            field=f"contests, {contest.rerun[:8]}",
+            remedy="Run the method of the entry again with its settings, seed and budget.",
+        )
+    rerun = replace(make_entry(contest.results), name=f"{entry.name}, contest {contest.rerun[:8]}")
+    check_entries([rerun])
+    check_complete(rerun)
+    check_bound(rerun)
 
 
 def check_dates(entry: Entry, now: datetime | None = None) -> None:
@@ -384,11 +449,11 @@ def check_dates(entry: Entry, now: datetime | None = None) -> None:
         started = started.replace(tzinfo=UTC)
     if started > latest:
         raise _wrong(entry, "started", f"is {entry.results.started}, which is not yet")
-    for check in entry.checks:
+    for check in entry.additions:
         _check_date(entry, check, started, latest)
 
 
-def _check_date(entry: Entry, check: Check, started: datetime, latest: datetime) -> None:
+def _check_date(entry: Entry, check: Check | Contest, started: datetime, latest: datetime) -> None:
     date = datetime.fromisoformat(check.date)
     if date > latest or date < started:
         problem = "is not yet" if date > latest else f"is before {entry.results.started}, its run"
@@ -396,8 +461,7 @@ def _check_date(entry: Entry, check: Check, started: datetime, latest: datetime)
             f"is dated {check.date}, which {problem}",
             where=entry.name,
             field=f"checks, {check.kind} {check.digest[:8]}",
-            remedy="Look at the clock of the machine; check again with "
-            "`hwp-bench leaderboard confirm`.",
+            remedy="Look at the clock of the machine, and make the file again.",
         )
 
 
@@ -409,22 +473,29 @@ def _check_overruling(entry: Entry, check: Check) -> None:
 
 
 def without_false_checks(entry: Entry, now: datetime | None = None) -> Entry:
-    """Return the entry without checks that are false; each of them is said."""
-    kept = []
-    for check in entry.checks:
-        alone = replace(entry, checks=(check,))
+    """Return the entry without checks and contests that are false; each of them is said."""
+    kept: list[Check | Contest] = []
+    for check in entry.additions:
         try:
-            check_dates(alone, now)
-            if entry.protocol == HWP_V1.name:
-                _check_verdict(entry, check)
-                _check_overruling(entry, check)
-        except BadResult as error:
+            if isinstance(check, Contest):
+                check_dates(replace(entry, checks=(), contests=(check,)), now)
+                check_contest(entry, check)
+            else:
+                check_dates(replace(entry, checks=(check,), contests=()), now)
+                if entry.protocol == HWP_V1.name:
+                    _check_verdict(entry, check)
+                    _check_overruling(entry, check)
+        except HwpError as error:
             if error.field == "started":
                 raise
             left_out(error)
         else:
             kept.append(check)
-    return replace(entry, checks=tuple(kept))
+    return replace(
+        entry,
+        checks=tuple(check for check in kept if isinstance(check, Check)),
+        contests=tuple(check for check in kept if isinstance(check, Contest)),
+    )
 
 
 def _check_data(entry: Entry, capture: CaptureResult, data: CaptureData | None) -> None:
@@ -532,7 +603,7 @@ def sound_entries(folder: Path) -> list[Entry]:
         try:
             check_entries([_alone(entry)])
             check_names([entry], listed)
-            check_dates(replace(entry, checks=()))
+            check_dates(replace(entry, checks=(), contests=()))
             entry = without_false_checks(entry)
             check_bound(entry)
         except HwpError as error:

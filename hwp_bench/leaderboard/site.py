@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,11 +23,11 @@ from hwp_bench.leaderboard.board import (
     budget_text,
     method_rows,
     ranks_of,
-    reference_lead,
     severities_of,
 )
-from hwp_bench.leaderboard.entries import BADGES, LEVEL_TEXTS, Entry, digest
-from hwp_bench.leaderboard.gallery import write_gallery
+from hwp_bench.leaderboard.data_card import data_card
+from hwp_bench.leaderboard.entries import BADGES, Entry, digest
+from hwp_bench.leaderboard.gallery import write_extremes, write_gallery
 from hwp_bench.leaderboard.rules import HEADLINE, SUITES, check_entries, source_of, tables_of
 from hwp_bench.methods.manifest import shipped_methods
 from hwp_bench.metrics import HWP_V1
@@ -36,6 +37,8 @@ from hwp_bench.report.page import provenance, render_template, style_sheet, writ
 from hwp_bench.report.sources import ResultsSource, open_captures_of
 from hwp_bench.report.study_tables import METRIC
 from hwp_bench.results.published import NOTE, read_published
+from hwp_bench.results.schema import TRAINING_KINDS
+from hwp_bench.taxonomy import SUITE_TEXTS
 
 #: Longest text of a method that is shown, characters.
 _LONGEST = 60_000
@@ -69,9 +72,11 @@ def method_pages(rows: Sequence[BoardRow]) -> list[MethodPage]:
 
 
 def write_method_pages(
-    folder: Path, pages: Sequence[MethodPage], scenes: Sequence[Mapping[str, Any]] = ()
+    folder: Path,
+    pages: Sequence[MethodPage],
+    extremes: Mapping[str, Sequence[Mapping[str, Any]]] | None = None,
 ) -> None:
-    """Write the pages into a site."""
+    """Write the pages into a site; `extremes` are those of `write_extremes`."""
     (folder / "methods").mkdir()
     shipped = {manifest.name: manifest for manifest in shipped_methods()}
     for page in pages:
@@ -86,7 +91,8 @@ def write_method_pages(
             text=_formatted(readme.read_text("utf-8")) if readme and readme.is_file() else "",
             metrics=[metric_facts(name) for name in HEADLINE],
             scopes=SCOPES,
-            pictures=_pictures(page, scenes),
+            pictures=_pictures(page, extremes or {}),
+            contested=[entry for row in page.rows for entry in _contested(row)],
             avatars=_avatars(folder, page),
             facts=[_made_with(row) for row in page.rows],
             budget_text=budget_text,
@@ -110,15 +116,17 @@ def _formatted(text: str) -> Markup:
     return Markup(reader.renderer.render(tokens, reader.options, {}))
 
 
-def _pictures(page: MethodPage, scenes: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """The first frame of each capture that the gallery shows of the method."""
-    names = {entry.name for row in page.rows for entry in row.entries}
-    found: dict[str, dict[str, Any]] = {}
-    for scene in scenes:
-        for shot in scene["shots"]:
-            if shot["entry"] in names and scene["capture"] not in found:
-                found[scene["capture"]] = {**scene, "shot": shot}
-    return list(found.values())
+def _pictures(
+    page: MethodPage, extremes: Mapping[str, Sequence[Mapping[str, Any]]]
+) -> dict[str, Sequence[Mapping[str, Any]]]:
+    """By suite the best and worst frames of the first entry of the method that has pictures."""
+    entries = [entry for row in page.rows for entry in row.entries if entry.name in extremes]
+    return {entry.results.suite: extremes[entry.name] for entry in reversed(entries)}
+
+
+def _contested(row: BoardRow) -> list[Entry]:
+    """The entries of a row and its history that somebody contested, settled or not."""
+    return [entry for entry in (*row.entries, *row.older) if entry.contests]
 
 
 def _avatars(folder: Path, page: MethodPage) -> dict[str, str]:
@@ -141,6 +149,9 @@ def _made_with(row: BoardRow) -> dict[str, str]:
     seeds = ", ".join(str(seed) for seed in row.seeds)
     return provenance(results) | {
         "Suite, frames, seed": f"{results.suite}, {results.frames}, {seeds}",
+        "Digests of training data": _named(
+            {name: " ".join(own)} for name, own in results.method.training.simulated.items()
+        ),
         "Started": ", ".join(entry.results.started for entry in row.entries),
         "Protocol": ", ".join(results.protocols),
         "Seconds on one core": f"{sum(cpu) / len(cpu):.1f} a fit" if cpu else "",
@@ -199,6 +210,7 @@ def build_site(
         ]
         titles = _titles([entry for entry, _ in shown])
         scenes = write_gallery(temporary, shown, captures, titles)
+        extremes = write_extremes(temporary, shown, captures)
         pages = method_pages(rows)
         addresses = {row.name: page.path for page in pages for row in page.rows}
         files = {
@@ -208,13 +220,16 @@ def build_site(
         if scenes:
             files["gallery.js"] = f"var GALLERY = {canonical_json(scenes)};\n"
             files["viewer.js"] = script("viewer.js")
+        (temporary / "data").mkdir()
+        for suite in dict.fromkeys(row.suite for row in rows):
+            files[f"data/{suite}.json"] = json.dumps(data_card(suite), indent=1) + "\n"
         for name, text in files.items():
             (temporary / name).write_text(text, encoding="utf-8")
         for entry in entries:
             source = ResultsSource(entry.results, folders.get(digest(entry.results)))
             report = temporary / "reports" / entry.name
             write_report(report, [source], avatar_pages=avatar_pages)
-        write_method_pages(temporary, pages, scenes)
+        write_method_pages(temporary, pages, extremes)
     return folder / "index.html"
 
 
@@ -255,37 +270,41 @@ def shown_rows(entries: Sequence[Entry]) -> list[BoardRow]:
 
 def board_page(rows: Sequence[BoardRow], *, pictures: bool, pages: Mapping[str, str]) -> str:
     """Return the page of the board."""
-    suites = list(dict.fromkeys(row.suite for row in rows))
     ranks: dict[str, tuple[int, str]] = {}
-    leads, verdicts, plots = [], {}, {}
-    for suite in suites:
-        table = [row for row in rows if row.suite == suite]
-        placed, verdicts[suite] = ranks_of(table)
-        ranks |= {name: (rank.rank, rank.interval) for name, rank in placed.items()}
-        leads.append(reference_lead(table))
-        plots[suite] = curve_plot(table)
+    suites = []
+    for name in dict.fromkeys(row.suite for row in rows):
+        table = [row for row in rows if row.suite == name]
+        placed, verdict = ranks_of(table)
+        ranks |= {key: (rank.rank, rank.interval) for key, rank in placed.items()}
+        text = SUITE_TEXTS[name]
+        suites.append(
+            {
+                "name": name,
+                "text": text,
+                "rows": table,
+                "verdict": verdict,
+                "plot": curve_plot(table),
+            }
+        )
+    kinds = [kind for kind in TRAINING_KINDS if any(kind in row.training for row in rows)]
     return render_template(
         "hwp_bench.leaderboard",
         "board.html.j2",
         title=TITLE,
         style=style_sheet(),
-        rows=rows,
+        suites=suites,
         ranks=ranks,
-        leads=list(filter(None, leads)),
-        verdicts={suite: text for suite, text in verdicts.items() if text},
-        plots={suite: plot for suite, plot in plots.items() if plot},
         pages=pages,
         scopes=SCOPES,
         severities=severities_of(rows),
         metrics=[metric_facts(name) for name in HEADLINE],
-        suites=suites,
         budgets=list(dict.fromkeys(row.budget for row in rows)),
+        kinds={kind: TRAINING_KINDS[kind] for kind in kinds},
         published=_published(),
         note=NOTE,
         scores_json=_scores_json,
         pictures=pictures,
-        levels=LEVEL_TEXTS,
-        badges=BADGES,
+        badges={name: text for name, text in BADGES.items() if name in {row.badge for row in rows}},
     )
 
 

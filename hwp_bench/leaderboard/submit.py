@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Literal, cast
 
 from hwp_bench.base.errors import BadResult, UsageError
 from hwp_bench.base.files import atomic_folder, files_digest, sha256_of
@@ -14,6 +15,7 @@ from hwp_bench.evaluation.scoring import predictions_digest, read_predictions
 from hwp_bench.evaluation.verify import verify_results
 from hwp_bench.leaderboard.entries import (
     Check,
+    Contest,
     Entry,
     Submission,
     digest,
@@ -25,13 +27,14 @@ from hwp_bench.leaderboard.rules import (
     HEADLINE,
     check_bound,
     check_complete,
+    check_contest,
     check_current,
     check_entries,
     current,
     register,
+    repeats,
     sound_entries,
 )
-from hwp_bench.leaderboard.suite_data import on_current_data
 from hwp_bench.report.sources import ResultsSource
 from hwp_bench.results import Results, read_results
 from hwp_bench.results.schema import environment
@@ -262,7 +265,7 @@ def _overruled(entry: Entry, named: Sequence[str]) -> list[str]:
 def entry_of(entries: Sequence[Entry], results: Results, name: str | None) -> Entry:
     """Return the entry of that name, or the only one that the results are of or repeat."""
     fitting = [entry for entry in entries if entry.results == results]
-    fitting = fitting or [entry for entry in entries if _repeats(entry.results, results)]
+    fitting = fitting or [entry for entry in entries if repeats(entry.results, results)]
     if name is None and len(fitting) > 1:
         fitting = [entry for entry in current(entries) if entry in fitting]
     if name is not None:
@@ -279,19 +282,38 @@ def entry_of(entries: Sequence[Entry], results: Results, name: str | None) -> En
     )
 
 
-def _repeats(entry: Results, results: Results) -> bool:
-    """Return whether two runs are of the same method in the same state on the same data."""
-    if entry.started == results.started:
-        return False
-    first, second = (
-        (
-            item.method,
-            item.suite,
-            item.seed,
-            item.budget,
-            item.frames,
-            sorted((c.id, c.digest, c.split_digest) for c in item.captures),
-        )
-        for item in (on_current_data(entry), on_current_data(results))
-    )
-    return first == second
+def contest(
+    entry: Entry, rerun: Path | str, *, by: str, reason: str, withdraws: str = ""
+) -> Contest:
+    """Return what puts a re-evaluation next to an entry, or what withdraws one of the two.
+
+    Args:
+        entry: the entry.
+        rerun: the re-evaluation's file; for a withdrawal the first digits of its digest.
+        by: who contests or withdraws.
+        reason: why.
+        withdraws: `entry` or `rerun` for a withdrawal.
+
+    Raises:
+        BadResult: the re-evaluation is not of the entry's method, state and data, or not sound.
+        UsageError: no contest of the entry has this digest.
+    """
+    results, full = None, str(rerun)
+    if withdraws:
+        known = {one.rerun for one in entry.contests if one.results}
+        fitting = [one for one in known if one.startswith(full)]
+        if len(full) < 8 or len(fitting) != 1:
+            raise UsageError(
+                f"{full!r} is not one re-evaluation of {entry.name}",
+                field="RERUN",
+                remedy=f"Contested by: {', '.join(sorted(one[:8] for one in known)) or 'none'}.",
+            )
+        (full,) = fitting
+    else:
+        results = read_results(rerun)
+        full = digest(results)
+    now = datetime.now(UTC).isoformat(timespec="seconds")
+    kind = cast('Literal["entry", "rerun"] | None', withdraws or None)
+    found = Contest(entry.name, entry.digest, full, now, by, reason, results, kind)
+    check_contest(entry, found)
+    return found

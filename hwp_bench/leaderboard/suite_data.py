@@ -21,8 +21,7 @@ from hwp_bench.capture.splits import split_for
 from hwp_bench.results import Results
 from hwp_bench.sim.produce.capture import RENDERER, suite, suite_names
 from hwp_bench.sim.scene.scene import moments, severity
-from hwp_bench.suites.real import read_clips
-from hwp_bench.suites.suite import is_of_suite
+from hwp_bench.suites.suite import is_of_suite, suite_scenes
 from hwp_bench.taxonomy import REAL_SUITES
 
 #: Version of the file.
@@ -103,7 +102,7 @@ def on_current_data(results: Results) -> Results:
 
 def suite_origins(name: str) -> Mapping[str, str]:
     """Return what each clip of a suite of real clips is imported from; empty for other suites."""
-    return {clip.id: clip.origin for clip in read_clips(name)} if name in REAL_SUITES else {}
+    return suite_scenes(name) if name in REAL_SUITES else {}
 
 
 #: By capture and perturbation: mean severity of the frames that show it, rounded.

@@ -26,6 +26,7 @@ from hwp_bench.base.records import (
 )
 from hwp_bench.methods.contents import digest_of, method_files
 from hwp_bench.methods.settings import class_settings
+from hwp_bench.results import TrainingData
 from hwp_bench.taxonomy import SIZED_LIKE
 
 #: Version of the method contract.
@@ -62,6 +63,16 @@ _SettingsItem = Annotated[
     ),
 ]
 _KindName = Annotated[str, _matching(r"[a-z][a-z0-9-]{0,31}", "a word of letters and digits")]
+#: What a method may choose by validation frames; it learns from training frames alone.
+VALIDATION_USES: Mapping[str, str] = {
+    "earlier-state": "the fit ends with an earlier state where that draws them better",
+    "settings": "single settings are chosen for the capture",
+    "shape": "how far the hand's shape is fitted is chosen",
+    "clean-frames": "training frames are judged by how these, which are clean, look",
+}
+_ValidationUse = Annotated[
+    str, _matching("|".join(VALIDATION_USES), f"one of {', '.join(VALIDATION_USES)}")
+]
 _SwitchSettings = Annotated[
     dict[_SettingName, Any], Meta(min_length=1, description="a table of at least one setting")
 ]
@@ -143,6 +154,8 @@ class ManifestFields:
     #: Short name: letters, digits, `.`, `_`, `-`.
     name: _MethodName
     entry: EntryPoint
+    #: What it was trained on before it sees a capture; `"none"` in the file where that is nothing.
+    training: TrainingData
     #: Name in tables; the short name where the file does not say.
     title: Line = ""
     description: Line = ""
@@ -150,6 +163,9 @@ class ManifestFields:
     authors: Line = ""
     licence: Line = ""
     url: Line = ""
+    #: What it uses validation frames for, at most: words of `VALIDATION_USES`, empty for nothing;
+    #: None where the file does not say.
+    validation: Annotated[list[_ValidationUse], Meta(max_length=10)] | None = None
     #: Names of its settings, dotted within tables. A name stands for everything below it, and
     #: `module:Class` for the fields of a dataclass.
     settings: list[_SettingsItem] = field(default_factory=list)
@@ -303,6 +319,7 @@ def read_manifest(path: str | os.PathLike[str]) -> MethodManifest:
         fields["authors"] = ", ".join(authors)
     if isinstance(fields.get("settings"), str):
         fields["settings"] = [fields["settings"]]
+    fields["training"] = _training(fields.get("training", ""), where)
     for kind in ("switches", "bases"):
         found = fields.get(kind)
         if isinstance(found, dict) and all(isinstance(item, dict) for item in found.values()):
@@ -328,6 +345,19 @@ def read_manifest(path: str | os.PathLike[str]) -> MethodManifest:
         manifest.check_setting_names(values, place)
     _check_switches(manifest, where)
     return manifest
+
+
+def _training(value: Any, where: Path) -> Any:
+    """Return the table of training data, empty for the word "none"."""
+    if value in ({}, "") or (isinstance(value, str) and value != "none"):
+        raise BadMethod(
+            "does not say what the method was trained on before it sees a capture",
+            where=where,
+            field="training",
+            remedy='Write `training = "none"` where that is nothing, else a table [training] with '
+            "`simulated`, `public` or `private` (docs/methods.md).",
+        )
+    return {} if value == "none" else value
 
 
 def _check_switches(manifest: MethodManifest, where: Path) -> None:

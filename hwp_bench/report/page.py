@@ -139,6 +139,7 @@ def provenance(result: Results) -> dict[str, str]:
     return {
         "Method": f"{result.method.title} ({result.method.name}), preset {result.method.preset}",
         "Settings": ", ".join(f"{k} = {v}" for k, v in result.method.settings.items()) or "none",
+        "Training data": result.method.training.text,
         "Suite, frames, seed": f"{result.suite}, {result.frames}, {result.seed}",
         "Budget": ", ".join(limits) or "none",
         "Started": result.started,

@@ -46,7 +46,7 @@ from hwp_bench.report.study_tables import (
 )
 from hwp_bench.report.tables import all_tables, free_view_table, over_seeds, same_data
 from hwp_bench.results import read_results
-from hwp_bench.results.schema import add_isolation_note
+from hwp_bench.results.schema import add_isolation_note, add_validation_note
 from hwp_bench.results.store import ABLATION
 
 #: The paper's table with the same content, by name of our table.
@@ -127,7 +127,7 @@ def _group_table(sources: Sequence[ResultsSource], request: TableRequest) -> Tab
         case "robustness":
             return robustness_table(sources, request.base)
         case "rank":
-            return rank_table(group_runs(results))
+            return add_validation_note(rank_table(group_runs(results)), results)
         case "free-view":
             return free_view_table(results)
         case "bias":

@@ -17,6 +17,7 @@ from hwp_bench.metrics.score import Aggregate, Scores, Summary, aggregate
 from hwp_bench.results import CaptureResult, FreeViewResult, Results
 from hwp_bench.results.schema import (
     add_isolation_note,
+    add_validation_note,
     differing_makers,
     differing_settings,
     per_second,
@@ -49,7 +50,7 @@ def all_tables(results: Sequence[Results]) -> dict[str, Table]:
     means = [aggregate(score_rows(result)) for result in results]
     groups = _groups(means)
     tables = {
-        "overall": overall_table(results, groups, HEADLINE),
+        "overall": add_validation_note(overall_table(results, groups, HEADLINE), results),
         "captures": capture_table(results, means),
         "perturbations": perturbation_table(results, means),
         "details": mean_table(results, groups, _of_protocol(HWP_V1)),

@@ -7,6 +7,7 @@ from hwp_bench.results.schema import (
     FreeViewResult,
     MethodId,
     Results,
+    TrainingData,
 )
 from hwp_bench.results.store import (
     read_all,
@@ -24,6 +25,7 @@ __all__ = [
     "FreeViewResult",
     "MethodId",
     "Results",
+    "TrainingData",
     "read_all",
     "read_results",
     "read_unchanged",

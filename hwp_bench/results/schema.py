@@ -21,7 +21,7 @@ from msgspec import Meta
 from hwp_bench.base import packages
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import canonical_json, files_digest
-from hwp_bench.base.records import Count, Line, Message, Seconds, Seed
+from hwp_bench.base.records import Count, Digest, Line, Message, Seconds, Seed
 from hwp_bench.base.tables import Table
 from hwp_bench.metrics import METRICS
 from hwp_bench.metrics.score import CaptureScores, Scores, aggregate
@@ -171,6 +171,52 @@ class CaptureResult:
         return sum(frame.failure is not None for frame in self.frames)
 
 
+#: What a method can have been trained on before it sees a capture, in words for people.
+TRAINING_KINDS = {
+    "none": "none",
+    "simulated": "simulated people",
+    "public": "public data sets",
+    "private": "private data",
+}
+
+
+@dataclass(frozen=True)
+class TrainingData:
+    """The data that a method was trained on before it saw a capture; none where all is empty."""
+
+    #: Simulated people: by the name of a scene the digests of what was rendered (`Scene.digest`,
+    #: in a capture's file `source.scene_digest`). People without a scene have a name of their own.
+    simulated: Annotated[
+        dict[Line, Annotated[list[Digest], Meta(min_length=1, max_length=1000)]],
+        Meta(max_length=1000),
+    ] = field(default_factory=dict)
+    #: Data sets that anybody can have, by name.
+    public: Annotated[list[Line], Meta(max_length=100)] = field(default_factory=list)
+    #: Data that others cannot have, each in a few words.
+    private: Annotated[list[Line], Meta(max_length=100)] = field(default_factory=list)
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Which of `TRAINING_KINDS` it is of; at least one."""
+        return tuple(name for name in TRAINING_KINDS if getattr(self, name, None)) or ("none",)
+
+    @property
+    def text(self) -> str:
+        """Kinds and names, in words for people."""
+        names = {name: ", ".join(getattr(self, name, ())) for name in self.kinds}
+        parts = [TRAINING_KINDS[name] + (f" ({own})" if own else "") for name, own in names.items()]
+        return "; ".join(parts)
+
+    def shared(self, scenes: Mapping[str, str]) -> list[str]:
+        """Return which of some scenes or clips, digests by name, are among it.
+
+        One is known by its name, whoever is seen in it, and by its digest under any name.
+        """
+        digests = {digest for own in self.simulated.values() for digest in own}
+        names = {*self.simulated, *self.public, *self.private}
+        return [name for name, digest in scenes.items() if name in names or digest in digests]
+
+
 @dataclass(frozen=True)
 class MethodId:
     """Which method, in which state."""
@@ -185,6 +231,11 @@ class MethodId:
     preset: Line
     #: The settings that it was run with.
     settings: FreeTable
+    #: What it was trained on before, as its `method.toml` declares it.
+    training: TrainingData
+    #: What it declares to use validation frames for; None where it does not say, and where it was
+    #: not recorded.
+    validation: Annotated[list[Line], Meta(max_length=10)] | None = None
 
     def __post_init__(self) -> None:
         check_table(self.settings, "settings")
@@ -367,6 +418,22 @@ def add_isolation_note(table: Table, results: Sequence[Results]) -> Table:
     """Return a table with `isolation_note` below it, once."""
     note = isolation_note(results)
     return table if note in ("", *table.notes) else replace(table, notes=(*table.notes, note))
+
+
+# --- what validation frames are used for
+
+
+def add_validation_note(table: Table, results: Sequence[Results]) -> Table:
+    """Return a table with a line below it of what each method uses validation frames for."""
+    titles: dict[str, dict[str, None]] = {}
+    for one in results:
+        uses = one.method.validation
+        text = "not declared" if uses is None else ", ".join(uses) or "nothing"
+        titles.setdefault(text, {})[one.method.title] = None
+    if titles.keys() <= {"not declared"}:
+        return table
+    told = "; ".join(f"{', '.join(names)}: {text}" for text, names in titles.items())
+    return replace(table, notes=(*table.notes, f"Declared uses of validation frames: {told}."))
 
 
 # --- the environment of a result

@@ -73,9 +73,12 @@ def _read(path: Path) -> tuple[Results, Mapping[str, Any]]:
 def result_files(path: str | os.PathLike[str]) -> list[Path]:
     """Return the result files that a path stands for.
 
-    It is a `results.json`, a results folder, an `ablation.json`, or an ablation's folder.
+    It is a `results.json`, a results folder, an `ablation.json`, an ablation's folder, or the
+    folder of several methods and seeds.
     """
     place = Path(path)
+    if several := _several(place):
+        return several
     record = place / ABLATION if place.is_dir() else place
     if record.name != ABLATION or not record.is_file():
         return [place / "results.json" if place.is_dir() else place]
@@ -85,6 +88,20 @@ def result_files(path: str | os.PathLike[str]) -> list[Path]:
         return [inside(record.parent, name) for name in names]
     except (KeyError, TypeError) as error:
         raise BadResult("does not list its results", where=record, field="variants") from error
+
+
+def seed_folder(folder: Path, method: str, seed: int) -> Path:
+    """Return the results folder of one seed of a method in the folder of several."""
+    return folder / method / f"seed-{seed}"
+
+
+def _several(place: Path) -> list[Path]:
+    """Return the result files in a folder of several methods and seeds; none of any other."""
+    return [] if _single(place) else sorted(place.glob("*/seed-*/results.json"))
+
+
+def _single(folder: Path) -> bool:
+    return any((folder / name).is_file() for name in ("results.json", ABLATION))
 
 
 def results_among(paths: Iterable[str | os.PathLike[str]]) -> list[Path]:
@@ -104,7 +121,7 @@ def results_among(paths: Iterable[str | os.PathLike[str]]) -> list[Path]:
 
 def _holds_none(place: Path) -> bool:
     if place.is_dir():
-        return not any((place / name).is_file() for name in ("results.json", ABLATION))
+        return not _single(place) and not _several(place)
     return place.is_file() and place.suffix != ".json"
 
 

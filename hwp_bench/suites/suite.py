@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Protocol
 
@@ -21,6 +22,10 @@ class SuiteCapture(Protocol):
     @property
     def id(self) -> str:
         """Id of the capture."""
+
+    @property
+    def shows(self) -> str:
+        """One line for people that says what it shows."""
 
     @property
     def hands(self) -> str:
@@ -83,6 +88,14 @@ def is_ready(name: str) -> bool:
     if name in REAL_SUITES:
         return all(clip.is_whole() for clip in read_clips(name))
     return simulated.is_rendered(name)
+
+
+@cache
+def suite_scenes(name: str) -> Mapping[str, str]:
+    """Return what the captures of a suite are made of: digests of scenes or clips by id."""
+    if name in REAL_SUITES:
+        return {clip.id: clip.origin for clip in read_clips(name)}
+    return {item.id: item.scene.digest for item in simulated.suite(name)}
 
 
 # --- what a result lacks

@@ -43,7 +43,8 @@ def gray_method(tmp_path: Path) -> Path:
     folder.mkdir()
     (folder / "gray_method.py").write_text(METHOD)
     (folder / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "gray"\n[entry]\npython = "gray_method:Gray"\n'
+        'schema = "hwp-method/1"\ntraining = "none"\n'
+        'name = "gray"\n[entry]\npython = "gray_method:Gray"\n'
         "[presets.default]\ngray = 0.5\n"
     )
     return folder

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from hwp_bench.methods.contract import TrainingCapture
-from wildghand.fitting.choice import Averaging, StateChoice, ValidationFrames
+from wildghand.fitting.choice import AveragedSteps, StateChoice, ValidationFrames
 from wildghand.fitting.colors import StartColors
 from wildghand.fitting.disentangle import Dpd, GeometryDropout
 from wildghand.fitting.fit import Component, Fit
@@ -35,7 +35,7 @@ def components_of(settings: WildGHandSettings) -> list[Component]:
         (pao.hand != "estimated", HandMasks),
         (bool(settings.prior), StartFromPrior),
         (chosen, ValidationFrames),
-        (True, Averaging),
+        (True, AveragedSteps),
         (settings.schedule.validated, StateChoice),
         (settings.shadows.enabled or settings.light.enabled, Lighting),
         (settings.start_colors, StartColors),

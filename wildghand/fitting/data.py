@@ -20,12 +20,11 @@ from wildghand.gaussians.training import (
     TrainingClip,
     TrainingFrames,
     load_frames,
-    load_validation_frames,
+    load_judges,
     shares_of_255,
     upload,
 )
 from wildghand.subject import SubjectShape
-from wildghand.subject.fit_subject import LEAST_CHOOSING, MOST_CHOOSING
 
 #: Edge of a place of the skin, m on the rest hand: about half a segment of a finger.
 PLACE = 0.01
@@ -83,8 +82,7 @@ class FitData:
     @functools.cached_property
     def judges(self) -> TrainingFrames | None:
         """Validation frames, which no step sees; None where they are too few to choose anything."""
-        frames = load_validation_frames(self.training, MOST_CHOOSING)
-        return frames if len(frames) >= LEAST_CHOOSING else None
+        return load_judges(self.training)
 
     @functools.cached_property
     def judgement(self) -> Judgement:

@@ -19,11 +19,12 @@ import torch
 from torch import Tensor
 
 from hwp_bench.base.arrays import evenly
-from wildghand.fitting.choice import JudgedDrawings, ValidationFrames, choose
+from wildghand.fitting.choice import JudgedDrawings, ValidationFrames
 from wildghand.fitting.colors import FilledColors, neighbours
 from wildghand.fitting.fit import Component, Fit
 from wildghand.gaussians.training import TrainingClip
 from wildghand.model.model import WildGHandModel
+from wildghand.plain.choice import choose
 from wildghand.visibility import (
     ColorChanges,
     Visibility,

@@ -24,16 +24,18 @@ from hwp_bench.importers.shared.landmarks import read_hand_tracks, read_sides
 from hwp_bench.importers.video import FrameRange, VideoImport, import_video
 from hwp_bench.importers.video.api import IMPORTER_VERSION
 from hwp_bench.importers.video.decode import probe
-from hwp_bench.methods.contract import Budget
+from hwp_bench.methods.contract import Budget, HandPose
 from hwp_bench.tracking import TrackerSettings, track_video
 from hwp_bench.tracking.track_video import NoHandSeen, landmark_sheet
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import DESCRIPTION, MODEL, WEIGHTS, load_avatar
+from wildghand.avatar.studio import REST, Pose
 from wildghand.fitting.session import fit_capture, unfinished
 from wildghand.from_video.run import Stage, VideoJob
 from wildghand.from_video.verdict import judge_avatar, read_verdict
 from wildghand.model.settings import read_settings
 from wildghand.page import write_page
+from wildghand.page.write import start_of_clip
 
 #: Edge of the turntable, px; frames of one turn, and in a second.
 SIZE, FRAMES, FPS = 480, 96, 24
@@ -44,20 +46,28 @@ COLUMNS, EDGE = 6, 256
 
 
 class Turntable:
-    """Draws an avatar at rest from all around (`wildghand.avatar.studio`).
+    """Draws an avatar from all around (`wildghand.avatar.studio`).
 
     Args:
         avatar: what is drawn; two hands stand next to each other and turn together.
         size: edge of the square pictures, px.
+        pose: whose fingers they have; None: at rest.
     """
 
-    def __init__(self, avatar: WildGHandAvatar, size: int) -> None:
+    def __init__(
+        self, avatar: WildGHandAvatar, size: int, pose: Mapping[str, HandPose] | None = None
+    ) -> None:
         self._avatar = avatar
         self._camera = avatar.studio.camera(size, size)
+        self._poses: dict[str, Pose] = dict.fromkeys(avatar.sides, REST)
+        if pose is not None:
+            self._poses = {side: pose[side].pose[1:] for side in avatar.sides}
 
     def view(self, degrees: float) -> np.ndarray:
         """Draw it turned about the vertical, (size, size, 3) uint8; at 0 the palm is in front."""
-        rgba = self._avatar.render(self._avatar.studio.posed(turn=degrees), self._camera)
+        studio = self._avatar.studio
+        hands = {side: studio.posed(pose, degrees)[side] for side, pose in self._poses.items()}
+        rgba = self._avatar.render(hands, self._camera)
         return as_uint8(rgba[..., :3] + (1.0 - rgba[..., 3:]) * (BACKGROUND / 255.0))
 
 
@@ -66,7 +76,7 @@ def avatar_sheet(avatar: WildGHandAvatar, capture: Capture, weights: Path) -> np
 
     In rows of `COLUMNS`: frames, evenly spaced among those that were fitted; the avatar in their
     poses; how much each pixel counted in the fit, white for most, where the folder `weights` has
-    masks; the avatar at rest, turned in steps.
+    masks; the avatar in a pose of the clip, turned in steps.
     """
     masks = {int(path.stem): path for path in sorted(weights.glob("[0-9]*.png"))}
     fitted_frames = sorted(masks) or avatar.record.frames
@@ -83,7 +93,7 @@ def avatar_sheet(avatar: WildGHandAvatar, capture: Capture, weights: Path) -> np
         if frame in masks:
             gray = read_gray(masks[frame], capture.size)
             rows[2].append(_tile(np.repeat(gray[:, :, None], 3, axis=2), "weights"))
-    table = Turntable(avatar, EDGE)
+    table = Turntable(avatar, EDGE, start_of_clip(avatar, capture))
     angles = [360.0 * step / COLUMNS for step in range(COLUMNS)]
     rows.append([_tile(table.view(angle), f"turned {angle:.0f} degrees") for angle in angles])
     blank = np.full_like(rows[3][0], 250)
@@ -130,7 +140,7 @@ class Picture(Stage):
 
 def draw_turntable(job: VideoJob, avatar: WildGHandAvatar) -> None:
     """Draw the avatar from all around, as it stands in its studio."""
-    table = Turntable(avatar, SIZE)
+    table = Turntable(avatar, SIZE, start_of_clip(avatar, open_capture(job.capture)))
     angles = track([360.0 * frame / FRAMES for frame in range(FRAMES)], "drawing the turntable")
     write_movie(job.turntable, (table.view(angle) for angle in angles), FPS)
 
@@ -341,11 +351,11 @@ STAGES: tuple[Stage, ...] = (
     Picture(
         "turntable",
         "Drawing the turntable",
-        str((2, SIZE, FRAMES, FPS, BACKGROUND)),
+        str((3, SIZE, FRAMES, FPS, BACKGROUND)),
         4.0 + 0.1 * FRAMES,
         draw_turntable,
     ),
     Picture("verdict", "Judging the avatar", "1", 6.0, write_verdict),
-    Picture("sheet", "Drawing the contact sheet", str((2, COLUMNS, EDGE)), 6.0, draw_sheet),
-    Picture("page", "Writing the page", "1", 15.0, write_avatar_page),
+    Picture("sheet", "Drawing the contact sheet", str((3, COLUMNS, EDGE)), 6.0, draw_sheet),
+    Picture("page", "Writing the page", "2", 15.0, write_avatar_page),
 )

@@ -148,6 +148,16 @@ def load_frames(training: TrainingCapture) -> TrainingFrames:
     return frames
 
 
+#: Frames that choose, at most and at least: one or two say little.
+MOST_CHOOSING, LEAST_CHOOSING = 8, 4
+
+
+def load_judges(training: TrainingCapture) -> TrainingFrames | None:
+    """Read the validation frames that choose, which no step sees; None where they are too few."""
+    frames = load_validation_frames(training, MOST_CHOOSING)
+    return frames if len(frames) >= LEAST_CHOOSING else None
+
+
 def load_validation_frames(training: TrainingCapture, most: int) -> TrainingFrames:
     """Read at most so many validation frames, evenly spread; there may be none.
 

@@ -91,13 +91,11 @@ def sample_poses(
         clip = {side: start[side].pose[None] for side in avatar.sides}
     else:
         _check(avatar, capture)
-        fitted = [frame for frame in avatar.record.frames if _shown(avatar, capture, frame)]
-        if not fitted:
-            raise UsageError("has no fitted frame that shows every hand", where=capture.root)
+        fitted = _fitted(avatar, capture)
         frames = [fitted[pick] for pick in evenly(len(fitted), settings.most_frames)]
         drawn = [fitted[pick] for pick in evenly(len(fitted), settings.clip_samples)]
         poses = {f: avatar.believed(capture.hand_poses(f)) for f in fitted}
-        start = best_start(avatar, [poses[fitted[k]] for k in evenly(len(fitted), _TRIED)])
+        start = start_of_clip(avatar, capture)
         clip = {
             side: np.stack([start[side].pose, *(poses[frame][side].pose for frame in drawn)])
             for side in avatar.sides
@@ -120,8 +118,9 @@ def best_start(
 ) -> dict[str, HandPose]:
     """Hands in the studio, where the light is as frames have shown it.
 
-    Of the rest pose and the fingers of those that are tried, in each turn, it is the one with most
-    skin to the camera that frames show well, less the skin that they do not.
+    Of the poses of fingers that are tried, or else at rest, in each turn, it is the one with most
+    skin to the camera that frames show well, less the skin that they do not. A clip says how a hand
+    looks in its own poses: at rest the insides of fingers that are always bent would be blotches.
     """
     studio, visibility, rigs = avatar.studio, avatar.model.visibility, avatar.model.rigs
     if visibility is None:
@@ -142,9 +141,18 @@ def best_start(
         for turn in _TURNS:
             yield {side: studio.posed(pose, turn)[side] for side, pose in poses.items()}
 
-    poses: list[dict[str, Pose]] = [dict.fromkeys(avatar.sides, REST)]
-    poses += [{side: hands[side].pose[1:] for side in avatar.sides} for hands in tried]
-    return max((hands for each in poses for hands in in_turns(each)), key=shown)
+    rest: dict[str, Pose] = dict.fromkeys(avatar.sides, REST)
+    of_clip: list[dict[str, Pose]] = [
+        {side: hands[side].pose[1:] for side in avatar.sides} for hands in tried
+    ]
+    return max((hands for poses in of_clip or [rest] for hands in in_turns(poses)), key=shown)
+
+
+def start_of_clip(avatar: WildGHandAvatar, capture: Capture) -> dict[str, HandPose]:
+    """Hands in the studio in the pose of the clip that `best_start` finds."""
+    fitted = _fitted(avatar, capture)
+    tried = [fitted[pick] for pick in evenly(len(fitted), _TRIED)]
+    return best_start(avatar, [avatar.believed(capture.hand_poses(frame)) for frame in tried])
 
 
 def hand_controls(avatar: WildGHandAvatar, side: str) -> dict[str, Any]:
@@ -182,8 +190,13 @@ def _check(avatar: WildGHandAvatar, capture: Capture) -> None:
         )
 
 
-def _shown(avatar: WildGHandAvatar, capture: Capture, frame: int) -> bool:
-    return all(bool(capture.hands[side].valid[frame]) for side in avatar.sides)
+def _fitted(avatar: WildGHandAvatar, capture: Capture) -> list[int]:
+    """The fitted frames that show every hand of the avatar."""
+    valid = [capture.hands[side].valid for side in avatar.sides]
+    found = [frame for frame in avatar.record.frames if all(one[frame] for one in valid)]
+    if not found:
+        raise UsageError("has no fitted frame that shows every hand", where=capture.root)
+    return found
 
 
 # Field of view of the still image, and how much of it the hand fills.

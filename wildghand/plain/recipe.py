@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import math
+import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, TypeVar
@@ -25,7 +26,15 @@ from wildghand.gaussians.training import (
     TrainingClip,
     TrainingFrames,
     load_frames,
+    load_judges,
     soft_weights,
+)
+from wildghand.plain.choice import (
+    AveragedAvatar,
+    Averaging,
+    KeptStates,
+    steps_to_first,
+    validation_error,
 )
 from wildghand.plain.loop import IterativeFit, run_fit
 from wildghand.plain.model import PlainAvatar, PlainModel, make_model
@@ -34,6 +43,8 @@ from wildghand.splat.threads import denormals_flushed
 # Adam's epsilon: gradients of a mean over all pixels are small.
 _EPSILON = 1e-15
 _BETAS = (0.9, 0.99)
+# A fit ends with a mean of its steps, nearly all of it from this share of them, the last ones.
+_AVERAGE_SHARE = 0.1
 
 
 @dataclass(frozen=True)
@@ -56,6 +67,10 @@ class LoopSettings:
     #: The steps' size at the end of the budget, as a share of that at its start; in between it
     #: falls geometrically.
     final_rate: float = number(0.05, 1e-6, 1.0)
+    #: End with the mean of the last tenth of the steps, or with an earlier such mean that draws the
+    #: validation frames better; with fewer than four of these it is the last one. Without: end
+    #: with the last step.
+    validated: bool = True
     #: `auto` (CUDA where both a GPU and gsplat are there), `cpu` or `cuda`.
     device: str = choice("auto", "cpu", "cuda")
 
@@ -131,7 +146,9 @@ class Drawing:
 class Recipe(IterativeFit[Avatar], Generic[Settings]):
     """A fit with its hooks. The plain fit is one; a method with a model of its own is another.
 
-    Each step calls `draw`, `weights`, `loss` and, after Adam's step, `move_back`.
+    Each step calls `draw`, `weights`, `loss` and, after Adam's step, `move_back`. What any
+    method can have is here: the mean of the last steps, and the choice of an earlier state by
+    validation frames (`wildghand.plain.choice`).
     Hooks keep what they need as attributes; tensors that Adam fits are named by `parameters`.
 
     Args:
@@ -148,6 +165,10 @@ class Recipe(IterativeFit[Avatar], Generic[Settings]):
     def parameters(self) -> dict[str, torch.Tensor]:
         """The tensors that Adam fits, by name, in a fixed order."""
         raise NotImplementedError
+
+    def state(self) -> dict[str, torch.Tensor]:
+        """All that makes a state of the fit: the fitted tensors, and others that avatars need."""
+        return self.parameters()
 
     def rates(self) -> dict[str, float]:
         """Adam's step at the start of each tensor: of `lamp` and `lamp.left` it is `lamp_rate`."""
@@ -202,6 +223,16 @@ class Recipe(IterativeFit[Avatar], Generic[Settings]):
         material = self.material
         return batches(len(material.frames), self.settings.batch, material.seed)
 
+    def after_step(self) -> None:
+        """See `IterativeFit`."""
+        self.average.take()
+        self._kept.take()
+
+    def seconds_now(self) -> float:
+        """See `IterativeFit`: about how long the choice among the states so far takes."""
+        most = self._kept.most_drawn
+        return most * self._seconds_to_judge if most else 0.0
+
     def step(self, batch: torch.Tensor, fraction: float) -> float:
         """See `IterativeFit`."""
         optimizer = self._optimizer
@@ -241,27 +272,67 @@ class Recipe(IterativeFit[Avatar], Generic[Settings]):
 
     def checkpoint(self, steps: int) -> Avatar:
         """See `IterativeFit`."""
-        return self.avatar(steps)
+        return AveragedAvatar(self.avatar(steps), self.average)
 
     def finish(self, steps: int, seconds: float) -> Avatar:
         """See `IterativeFit`."""
         for tensor in self.parameters().values():
             tensor.requires_grad_(False)
+        self.average.put()
+        self._kept.go_back(self.error, self.tell)
         return self.avatar(steps)
+
+    @functools.cached_property
+    def average(self) -> Averaging:
+        """The mean of the steps so far."""
+        share = _AVERAGE_SHARE if self.settings.validated else 0.0
+        return Averaging(self.state().values(), share)
+
+    @functools.cached_property
+    def _judges(self) -> TrainingFrames | None:
+        return load_judges(self.material.training) if self.settings.validated else None
+
+    @functools.cached_property
+    def _kept(self) -> KeptStates:
+        epoch = len(self.material.frames) / self.settings.batch
+        return KeptStates(self.average, 0 if self._judges is None else steps_to_first(epoch))
+
+    def error(self, count: int | None = None) -> float:
+        """Mean squared error of validation frames, or of `count` of them, as they are drawn now."""
+        training, judges, avatar = self.material.training, self._judges, self.avatar(self._steps)
+        assert judges is not None
+
+        def drawn(frame: int) -> torch.Tensor:
+            image = avatar.render(training.hand_poses(frame), training.camera(frame))
+            return torch.from_numpy(image[..., :3])
+
+        frames = enumerate(judges.indices[:count].tolist())
+        return validation_error(judges, ((row, drawn(frame)) for row, frame in frames))
+
+    @functools.cached_property
+    def _seconds_to_judge(self) -> float:
+        """About how long `error` takes, measured once; a first drawing takes longer."""
+        assert self._judges is not None
+        self.error(1)
+        begun = time.perf_counter()
+        self.error(1)
+        return len(self._judges) * (time.perf_counter() - begun)
 
     def finite(self) -> bool:
         """Whether every fitted number is finite."""
         return all(bool(value.isfinite().all()) for value in self.parameters().values())
 
     def snapshot(self) -> dict[str, torch.Tensor]:
-        """Copies of the fitted tensors, which the fit no longer changes."""
-        return {name: value.detach().clone() for name, value in self.parameters().items()}
+        """Copies of the state, which the fit no longer changes."""
+        return {name: value.detach().clone() for name, value in self.state().items()}
 
     @torch.no_grad()
     def restore(self, values: dict[str, torch.Tensor]) -> None:
         """Go back to a `snapshot`."""
-        for name, value in self.parameters().items():
+        for name, value in self.state().items():
             value.copy_(values[name])
+        self.average.forget()
+        self._kept.forget()
 
 
 # Standard deviations stay within these, m: thinner than paper or wider than a finger explains
@@ -369,7 +440,7 @@ class RecipeMethod:
 
     @denormals_flushed()
     def fit(self, training: TrainingCapture, budget: Budget, report: Report) -> Avatar:
-        """Fit an avatar to the training frames (the validation frames are left alone).
+        """Fit an avatar to the training frames; validation frames choose the state that it ends in.
 
         Args:
             training: what the method may see of the capture.

@@ -17,6 +17,7 @@ from scipy.linalg import solve
 from hwp_bench.base.arrays import evenly
 from hwp_bench.capture import Cameras
 from hwp_bench.hands import HandParameters, HandTemplate
+from wildghand.gaussians.training import LEAST_CHOOSING, MOST_CHOOSING
 from wildghand.subject.outlines import ComparedFrames
 from wildghand.subject.shape import SubjectShape
 from wildghand.subject.unknowns import Unknowns, outline_rows
@@ -31,8 +32,6 @@ NOISE = 1.5
 STIFFNESS = (8.0, 4.0, 2.0, 1.0, 0.7)
 #: The stiffness where no frames choose.
 FIXED_STIFFNESS = 4.0
-#: Frames that choose, at most and at least: one or two say little.
-MOST_CHOOSING, LEAST_CHOOSING = 8, 4
 # Share of the template's misfit in the frames that choose by which a softer hand must be better.
 _LEAST_GAIN = 0.04
 # Rounds; in each the silhouettes are drawn again, and a third one changes little.

@@ -347,6 +347,10 @@ class ScanRecipe(Recipe[ScanSettings]):
         """See `Recipe`."""
         return {**self.model.fitted(), **self.corrections.parameters()}
 
+    def state(self) -> dict[str, Tensor]:
+        """See `Recipe`."""
+        return {**self.parameters(), "textured": self.model.textured}
+
     def rate(self, name: str, fraction: float) -> float:
         """See `Recipe`. The texture waits for stage 2, in which the rest moves slowly."""
         late = fraction >= self.settings.shape_share
@@ -425,6 +429,7 @@ class ScanRecipe(Recipe[ScanSettings]):
             model.hand(side).texture.copy_(filled[index].clamp(0.0, _BRIGHTEST))
             self.unseen[side] = (~seen[index]).float().reshape(size, size)
         model.textured.fill_(1.0)
+        self.average.forget()  # its texture is not this one
 
     def avatar(self, steps: int) -> Avatar:
         """See `Recipe`."""
@@ -434,16 +439,6 @@ class ScanRecipe(Recipe[ScanSettings]):
             return drawn.image, drawn.coverage
 
         return DrawnAvatar(draw, self.model.rigs, self.device, steps)
-
-    def snapshot(self) -> dict[str, Tensor]:
-        """See `Recipe`."""
-        return {**super().snapshot(), "textured": self.model.textured.clone()}
-
-    @torch.no_grad()
-    def restore(self, values: dict[str, Tensor]) -> None:
-        """See `Recipe`."""
-        super().restore(values)
-        self.model.textured.copy_(values["textured"])
 
 
 def total_variation(planes: Tensor, where: Tensor | None = None) -> Tensor:

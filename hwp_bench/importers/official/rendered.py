@@ -249,6 +249,8 @@ def _manifest(name: str) -> str:
     return (
         f'schema = "{SCHEMA}"\nname = {text}\ntitle = "{name}"\n'
         'description = "Frames drawn by the authors\' code."\n'
-        'url = "https://github.com/XuanHuang0/WildGHand"\n\n'
+        'url = "https://github.com/XuanHuang0/WildGHand"\n'
+        # As the paper says of its network.
+        'training = { public = ["InterHand2.6M"] }\n\n'
         f'[entry]\npredictions = "{PREDICTIONS}"\n'
     )

@@ -20,10 +20,10 @@ var Board = {
       .map(function (pair) { return pair[1]; });
   },
 
-  // Whether a row is shown: each filter is empty or what the row has.
+  // Whether a row is shown: each filter is empty, or what the row has or one of several.
   shown: function (row, filters) {
     return Object.keys(filters).every(function (key) {
-      return filters[key] === "" || row[key] === filters[key];
+      return filters[key] === "" || [].concat(row[key]).indexOf(filters[key]) >= 0;
     });
   },
 
@@ -57,24 +57,29 @@ var Board = {
 
 if (typeof document !== "undefined") {
   (function () {
-    var table = document.getElementById("measured");
-    if (!table) { return; }
-    var groups = Array.prototype.map.call(table.tBodies, function (body) {
-      return { body: body, rows: Array.prototype.slice.call(body.querySelectorAll("tr[data-suite]")) };
+    var sections = document.querySelectorAll("section.suite");
+    if (!sections.length) { return; }
+    var groups = Array.prototype.map.call(sections, function (section) {
+      var body = section.querySelector("tbody");
+      return { section: section, body: body, rows: Array.prototype.slice.call(body.rows) };
     });
     var rows = groups.reduce(function (all, group) { return all.concat(group.rows); }, []);
-    var buttons = Array.prototype.slice.call(table.querySelectorAll("th button"));
+    var buttons = Array.prototype.slice.call(document.querySelectorAll("#measured th button"));
     var selects = {
       suite: document.getElementById("suite"),
       scope: document.getElementById("scope"),
       severity: document.getElementById("severity"),
       budget: document.getElementById("budget"),
+      training: document.getElementById("training"),
     };
     var status = document.getElementById("status");
-    var state = { suite: "", scope: "macro", severity: "", budget: "", sort: "psnr", down: "1" };
+    var state = {
+      suite: "", scope: "macro", severity: "", budget: "", training: "", sort: "psnr", down: "1",
+    };
 
     function facts(row) {
-      return { suite: row.dataset.suite, budget: row.dataset.budget };
+      var training = row.dataset.training.split(" ");
+      return { suite: row.dataset.suite, budget: row.dataset.budget, training: training };
     }
 
     function value(row, key) {
@@ -96,10 +101,8 @@ if (typeof document !== "undefined") {
           var score = value(row, cell.dataset.key);
           cell.textContent = score === null ? "–" : score.toFixed(Number(cell.dataset.digits));
         });
-        row.hidden = !Board.shown(facts(row), { suite: state.suite, budget: state.budget });
-      });
-      Array.prototype.forEach.call(document.querySelectorAll(".suite-plot"), function (plot) {
-        plot.hidden = !Board.shown({ suite: plot.dataset.suite }, { suite: state.suite });
+        var chosen = { suite: state.suite, budget: state.budget, training: state.training };
+        row.hidden = !Board.shown(facts(row), chosen);
       });
       // Rows are compared within their suite alone.
       groups.forEach(function (group) {
@@ -107,7 +110,7 @@ if (typeof document !== "undefined") {
         Board.order(cells, state.down === "1").forEach(function (index) {
           group.body.appendChild(group.rows[index]);
         });
-        group.body.hidden = group.rows.every(function (row) { return row.hidden; });
+        group.section.hidden = group.rows.every(function (row) { return row.hidden; });
       });
       buttons.forEach(function (button) {
         var on = button.dataset.sort === state.sort;

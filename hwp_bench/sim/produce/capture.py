@@ -511,6 +511,11 @@ class SuiteItem:
         return self.scene.id
 
     @property
+    def shows(self) -> str:
+        """Title of the scene, one line for people."""
+        return self.scene.title
+
+    @property
     def hands(self) -> str:
         """`right`, `left` or `both`."""
         return self.scene.hands

@@ -110,7 +110,9 @@ def test_lists_speak_json(capsys) -> None:
     suites += [f"persistent-clean{percent}" for percent in (0, 20, 35, 60)]
     suites.append("real-1")
     assert [row["suite"] for row in value["suites"]] == suites
-    assert "plain" in [row["method"] for row in value["methods"]]
+    uses = {row["method"]: row["validation frames"] for row in value["methods"]}
+    assert uses["plain"] == "earlier-state"
+    assert uses["wildghand"] == "earlier-state, settings, shape, clean-frames"
 
 
 def test_evaluate_prints_the_table_and_says_where_things_are(
@@ -123,7 +125,7 @@ def test_evaluate_prints_the_table_and_says_where_things_are(
     for frame in (18, 19):
         write_image(entry / "predictions" / "tiny" / f"{frame:06d}.png", capture.frame(frame))
     (entry / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "truth"\ntitle = "Truth [bold]"\n'
+        'schema = "hwp-method/1"\ntraining = "none"\nname = "truth"\ntitle = "Truth [bold]"\n'
         '[entry]\npredictions = "predictions"\n'
     )
     out = tmp_path / "out"
@@ -175,7 +177,7 @@ def test_a_stopped_evaluation_leaves_no_process_behind(
         f"import os, time\nopen({str(pid_file)!r}, 'w').write(str(os.getpid()))\ntime.sleep(600)\n"
     )
     (method / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "slow"\n'
+        'schema = "hwp-method/1"\ntraining = "none"\nname = "slow"\n'
         '[entry]\ncommand = ["{python}", "{method}/run.py"]\n'
     )
     words = ["evaluate", str(method), "--capture", str(capture.root), "--out", str(tmp_path / "o")]

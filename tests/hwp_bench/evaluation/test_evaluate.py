@@ -17,7 +17,7 @@ from hwp_bench.capture import Capture
 from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.cli.main import main
 from hwp_bench.evaluation.capture_evaluation import EvaluationSettings
-from hwp_bench.evaluation.evaluate import default_folder, evaluate
+from hwp_bench.evaluation.evaluate import default_folder, evaluate, make_budget
 from hwp_bench.methods.contract import Budget, RunSettings
 from hwp_bench.metrics import METRICS, metric, penalty
 from hwp_bench.results import Results, read_results
@@ -180,7 +180,8 @@ class Method:
 """
     )
     (folder / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "count"\n[entry]\npython = "counting_method:Method"\n'
+        'schema = "hwp-method/1"\ntraining = "none"\n'
+        'name = "count"\n[entry]\npython = "counting_method:Method"\n'
         "[presets.default]\nlevel = 0.5\n"
     )
     return folder
@@ -258,3 +259,6 @@ def test_budgets_and_seeds_have_results_folders_of_their_own() -> None:
     run = RunSettings({}, 1, Budget(16.0, 300))
     folder = default_folder("plain", EvaluationSettings("mini", run=run))
     assert folder == Path("runs/plain-mini-16s-300steps-seed1")
+    run = RunSettings({}, 0, make_budget(16.0, None))
+    folder = default_folder("plain", EvaluationSettings("mini", run=run))
+    assert folder == Path("runs/plain-mini-16s")

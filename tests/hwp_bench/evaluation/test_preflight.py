@@ -17,6 +17,7 @@ class Method:
 """
 MANIFEST = """
 schema = "hwp-method/1"
+training = "none"
 name = "mine"
 [entry]
 ENTRY

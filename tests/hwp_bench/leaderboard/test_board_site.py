@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -32,7 +33,7 @@ from hwp_bench.leaderboard.site import (
 from hwp_bench.methods.manifest import shipped_methods
 from hwp_bench.metrics import PROTOCOLS
 from hwp_bench.report.sources import ResultsSource
-from hwp_bench.results import FrameResult
+from hwp_bench.results import FrameResult, TrainingData
 
 EVIL = '"><img src=x onerror=alert(1)>'
 
@@ -71,6 +72,37 @@ def entries(make_results) -> list[Entry]:
         )
         found.append(Entry(entry_name(result), result))
     return found
+
+
+def test_suites_stand_apart_with_the_one_that_nothing_was_tuned_on_first() -> None:
+    made = [
+        make_entry(
+            replace(
+                complete_results(name, 20.0, suite_name=suite),
+                budget={"seconds": 16.0, "steps": 100_000},
+            )
+        )
+        for suite in ("mini", "wild-test")
+        for name in ("mine", "plain")
+    ]
+    page = page_of(made)
+    assert re.findall(r'<h2 id="h-\S+">(.*?)</h2>', page)[:2] == [
+        "wild-test: simulated hands as various as the world, on which nothing was tuned",
+        "mini: eight of the paper&#39;s captures, simulated and short",
+    ]
+    assert page.count("16 s, 100,000 steps</td>") == 4
+
+
+def test_the_training_data_stand_in_the_row(entries) -> None:
+    method = entries[0].results.method
+    kinds = TrainingData(public=["HanCo"], private=["scans"])
+    learnt = replace(entries[0].results, method=replace(method, training=kinds))
+    page = page_of([Entry("learnt", learnt), *entries[1:]])
+    assert 'data-training="public private"' in page
+    assert '<td data-key="training">public data sets, private data</td>' in page
+    options = re.search(r'<select id="training">(.*?)</select>', page)
+    assert options is not None
+    assert re.findall(r'value="(\w*)"', options[1]) == ["", "none", "public", "private"]
 
 
 def test_rows_hold_the_means_of_every_scope(entries) -> None:
@@ -115,6 +147,9 @@ def test_sorting_puts_what_was_not_measured_last(board) -> None:
 
 
 def test_filters_and_addresses(board) -> None:
+    row = "{suite: 'mini', budget: '60 s', training: ['public', 'private']}"
+    for kind, wanted in (("", True), ("private", True), ("none", False), ("pub", False)):
+        assert board.eval(f"Board.shown({row}, {{training: '{kind}'}})") is wanted
     shown = "Board.shown({suite: 'mini', budget: '60 s'}, {suite: %s, budget: %s})"
     for suite, budget, wanted in (("", "", True), ("mini", "60 s", True), ("smoke", "", False)):
         assert board.eval(shown % (json.dumps(suite), json.dumps(budget))) is wanted
@@ -178,6 +213,9 @@ def test_the_board_in_chromium(browser) -> None:
     assert [one.text for one in Select(browser.find_element(By.ID, "severity")).options] == ["all"]
     Select(browser.find_element(By.ID, "suite")).select_by_value("smoke")
     assert visible(browser) == ["Beta", EVIL]
+    Select(browser.find_element(By.ID, "training")).select_by_value("none")
+    assert visible(browser) == ["Beta", EVIL]
+    Select(browser.find_element(By.ID, "training")).select_by_value("")
     Select(browser.find_element(By.ID, "budget")).select_by_value("60 s")
     assert visible(browser) == ["Beta"]
     assert browser.find_element(By.ID, "status").text == "1 of 3 rows"
@@ -202,7 +240,7 @@ def test_everything_is_reached_with_the_tab_key(browser) -> None:
     from selenium.webdriver.common.keys import Keys
 
     reached = []
-    for _ in range(24):
+    for _ in range(60):
         browser.switch_to.active_element.send_keys(Keys.TAB)
         active = browser.switch_to.active_element
         if active.tag_name == "body":
@@ -252,7 +290,7 @@ def test_the_board_shows_the_current_revision_of_one_protocol(entries) -> None:
     assert second.name in page
     assert f"reports/{first.name}/" not in page
     assert "Omega" not in page
-    assert page.count('<td data-key="level"') == 3
+    assert page.count('<td data-key="badge"') == 3
     row = BoardRow((second,), older=(first,))
     assert (row.level, row.badge) == ("self-reported", "not tried")
     assert [(old.name, row.why_older(old)) for old in row.older] == [
@@ -464,9 +502,9 @@ def rows_of(*entries):
     return board_rows(entries)
 
 
-def written(folder: Path, *entries, scenes=()) -> dict[str, str]:
+def written(folder: Path, *entries) -> dict[str, str]:
     pages = method_pages(rows_of(*entries))
-    write_method_pages(folder, pages, scenes)
+    write_method_pages(folder, pages)
     return {page.title: (folder / page.path).read_text("utf-8") for page in pages}
 
 
@@ -525,19 +563,31 @@ def test_names_are_escaped_and_no_name_is_a_path(tmp_path: Path) -> None:
         assert "<script" not in file.read_text("utf-8")
 
 
-def test_pictures_are_the_first_frame_of_each_capture(tmp_path: Path) -> None:
-    entry = make_entry(results("plain"))
+def test_the_worst_frame_of_a_capture_stands_beside_its_best(built: Path) -> None:
+    """Frames 16, 17 and 18 have 30, 10 and 20 dB."""
+    pages = [file.read_text("utf-8") for file in (built.parent / "methods").glob("*.html")]
+    assert len(pages) == 2
+    for page in pages:
+        figures = re.findall(
+            r'<img src="../(\S+)" alt="truth">.*?<figcaption>(.*?)</fig', page, re.S
+        )
+        assert [text.split(", ", 1)[1].split(",")[0] for _, text in figures] == [
+            "best: frame 16",
+            "worst: frame 17",
+        ]
+        for address, text in figures:
+            frame = int(text.split("frame ")[1].split(",")[0])
+            assert (built.parent / address).name == f"{frame}-truth.jpg"
+            assert picture(built, address).max() > 50
+        assert "No pictures" not in page
 
-    def scene(capture: str, frame: int, name: str) -> dict:
-        shot = {"entry": name, "picture": f"p{frame}.jpg", "error": f"e{frame}.jpg", "psnr": 21.0}
-        return {"capture": capture, "frame": frame, "truth": f"t{frame}.jpg", "shots": [shot]}
 
-    scenes = [scene("c0", 4, "another"), scene("c0", 5, entry.name), scene("c0", 6, entry.name)]
-    page = written(tmp_path, entry, scenes=scenes)["Plain"]
-    assert 'src="../p5.jpg"' in page
-    assert "p4.jpg" not in page
-    assert "p6.jpg" not in page
-    assert "21.00 dB" in page
+def test_a_page_without_pictures_says_so_in_one_line(tmp_path: Path) -> None:
+    entries = [make_entry(complete_results("plain", suite_name=name)) for name in ("mini", "smoke")]
+    page = written(tmp_path, *entries)["Plain"]
+    (line,) = re.findall(r"<p>(No pictures.*?)</p>", page)
+    assert line.startswith("No pictures of mini, smoke: ")
+    assert "<img" not in page
 
 
 # Two captures have no interval; of more than four methods only the front has its bands.

@@ -16,6 +16,7 @@ from hwp_bench.evaluation.capture_evaluation import EvaluationSettings
 from hwp_bench.evaluation.evaluate import with_setting_files
 from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.manifest import (
+    VALIDATION_USES,
     MethodManifest,
     check_settings,
     find_method,
@@ -27,6 +28,7 @@ from hwp_bench.methods.settings import check_source, source_path
 
 GOOD = """
 schema = "hwp-method/1"
+training = "none"
 name = "mine"
 title = "My method"
 [entry]
@@ -59,6 +61,13 @@ def test_a_manifest_is_read(tmp_path: Path) -> None:
         manifest.preset("fast")
 
 
+def test_uses_of_validation_frames_are_declared_or_not(tmp_path: Path) -> None:
+    assert read_manifest(_write(tmp_path, GOOD)).validation is None
+    for uses in ([], ["shape"], list(VALIDATION_USES)):
+        text = GOOD.replace("[entry]", f"validation = {uses}\n[entry]")
+        assert read_manifest(_write(tmp_path, text)).validation == uses
+
+
 def test_authors_terms_and_page_are_kept(tmp_path: Path) -> None:
     plain = read_manifest(_write(tmp_path, GOOD))
     assert (plain.authors, plain.licence, plain.url) == ("", "", "")
@@ -85,6 +94,11 @@ def test_authors_terms_and_page_are_kept(tmp_path: Path) -> None:
             'title = "My method"',
             f'title = "{"x" * 2000}"',
             "xxx', expected one line of at most 1,000",
+        ),
+        (
+            "[entry]",
+            'validation = ["stopping"]\n[entry]',
+            "validation[0]: is 'stopping', expected one of earlier-state, settings, shape",
         ),
         ("title", "titel", "titel: is not known. Did you mean 'title'?"),
         (
@@ -206,7 +220,8 @@ def test_faults_of_switches_are_named(tmp_path: Path, old: str, new: str, proble
 
 def test_a_wrong_setting_is_refused_by_the_list_of_the_method(tmp_path: Path) -> None:
     (tmp_path / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "listed"\nsettings = ["steps", "light.degree", "former"]\n'
+        'schema = "hwp-method/1"\ntraining = "none"\n'
+        'name = "listed"\nsettings = ["steps", "light.degree", "former"]\n'
         '[entry]\npython = "a:b"\n[presets.default]\nlight.degree = 2\n'
     )
     manifest = read_manifest(tmp_path)
@@ -225,7 +240,7 @@ def test_a_wrong_setting_is_refused_by_the_list_of_the_method(tmp_path: Path) ->
 
 
 def test_presets_and_switches_must_have_listed_settings(tmp_path: Path) -> None:
-    head = 'schema = "hwp-method/1"\nname = "listed"\nsettings = ["steps"]\n'
+    head = 'schema = "hwp-method/1"\ntraining = "none"\nname = "listed"\nsettings = ["steps"]\n'
     entry = '[entry]\npython = "a:b"\n'
     for table, field in (
         ("[presets.quick]\nstep = 3\n", "presets.quick"),
@@ -254,6 +269,7 @@ def test_settings_may_be_a_class(tmp_path: Path) -> None:
 
 
 MANIFEST = """schema = "hwp-method/1"
+training = "none"
 name = "listed"
 settings = ["steps", "net.regions"]
 files = { "net.regions" = ["sam"] }

@@ -15,9 +15,9 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 
 from hwp_bench.base.errors import BadInput
-from wildghand.fitting.choice import Averaging, StateChoice
 from wildghand.fitting.session import SCHEMA, load_state
 from wildghand.gaussians.perceptual import Vgg19
+from wildghand.plain.choice import Averaging, KeptStates
 
 
 @pytest.mark.parametrize("reader", ["state", "weights"])
@@ -51,7 +51,7 @@ def test_a_state_that_keeps_no_tensors_is_damaged(tmp_path: Path, kept: Any) -> 
     file = tmp_path / "state.pt"
     parts = {"fit": {"steps": 9, "kept": kept}, "watchers": {}, "step": 9, "seconds": 1.0}
     torch.save({"schema": SCHEMA, "digest": "d", **parts}, file)
-    states = StateChoice(Averaging([], 0.0), 5)
+    states = KeptStates(Averaging([], 0.0), 5)
     fit = SimpleNamespace(device="cpu", load_state_dict=states.load_state_dict)
     with pytest.raises(BadInput, match="is damaged"):
         load_state(file, fit, None, "d")  # type: ignore[arg-type]

@@ -19,10 +19,11 @@ from painted import SilentReport
 from tiny_fits import QUICK
 
 from hwp_bench.methods.contract import Avatar, Budget, TrainingCapture
-from wildghand.fitting.choice import AveragedAvatar, Averaging
+from wildghand.fitting.choice import AveragedSteps
 from wildghand.fitting.components import make_fit
 from wildghand.gaussians.fit_loop import batches, repeatable
 from wildghand.model.settings import read_settings
+from wildghand.plain.choice import AveragedAvatar, Averaging
 from wildghand.plain.loop import run_fit
 
 FIT: dict[str, Any] = {**QUICK, "schedule.steps": 24}
@@ -129,8 +130,8 @@ def test_a_checkpoint_is_drawn_as_a_fit_that_ends_there(make_training: TrainingM
     with repeatable(CPU):
         for step in range(10):
             fit.step(next(order), step / 24)
-            part(fit, Averaging).take()
-    part(fit, Averaging).put()
+            part(fit, AveragedSteps).take()
+    part(fit, AveragedSteps).put()
     ended = fit.avatar(10).render(training.hand_poses(0), training.camera(0))
     np.testing.assert_array_equal(drawn[10], ended)
     assert np.abs(drawn[0] - ended).max() > 0.05

@@ -22,10 +22,11 @@ from tiny_fits import UNJUDGED
 from hwp_bench.capture.splits import Split
 from hwp_bench.methods.contract import Budget, TrainingCapture
 from wildghand.avatar.files import load_avatar, save_avatar
-from wildghand.fitting.choice import Averaging, StateChoice
+from wildghand.fitting.choice import AveragedSteps, StateChoice
 from wildghand.fitting.components import make_fit
 from wildghand.fitting.fit import Fit
 from wildghand.model.settings import read_settings
+from wildghand.plain.choice import Averaging, KeptStates
 from wildghand.plain.loop import run_fit
 
 TrainingMaker = Callable[..., TrainingCapture]
@@ -34,11 +35,11 @@ CPU = torch.device("cpu")
 FIT: dict[str, Any] = {**UNJUDGED, "schedule.steps": 20}
 
 
-def counted(steps: int, first: int, share: float = 1.0) -> tuple[torch.Tensor, StateChoice]:
+def counted(steps: int, first: int, share: float = 1.0) -> tuple[torch.Tensor, KeptStates]:
     """A fit whose tensor is the number of its step."""
     tensor = torch.zeros(3, dtype=torch.float64)
     average = Averaging([tensor], share)
-    states = StateChoice(average, first)
+    states = KeptStates(average, first)
     for step in range(1, steps + 1):
         tensor.fill_(step)
         average.take()
@@ -76,22 +77,24 @@ def test_it_goes_back_as_long_as_errors_fall(errors: list[float]) -> None:
         asked.append(round(place_of(tensor)))
         return errors[places.index(asked[-1])]
 
-    chosen = states.go_back(error)
+    states.go_back(error)
     last = next((k for k in range(3) if errors[k + 1] >= errors[k]), 3)
-    assert (chosen or 40) == places[last] == round(place_of(tensor))
+    assert (states.chosen or 40) == places[last] == round(place_of(tensor))
     # One error beyond the best is looked at, and none after that.
     assert asked == places[: min(last + 2, 4)]
 
 
 def test_an_error_that_is_not_finite_is_never_gone_back_to() -> None:
     tensor, states = counted(40, 5)
-    assert states.go_back(lambda: 1.0 if place_of(tensor) == 40 else math.nan) is None
+    states.go_back(lambda: 1.0 if place_of(tensor) == 40 else math.nan)
+    assert states.chosen is None
     assert place_of(tensor) == 40
 
 
 def test_a_short_fit_asks_for_nothing() -> None:
     tensor, states = counted(9, 5)
-    assert states.go_back(lambda: pytest.fail("nothing is to be chosen")) is None
+    states.go_back(lambda: pytest.fail("nothing is to be chosen"))
+    assert states.chosen is None
     assert place_of(tensor) == 9
     states.forget()
     assert states.candidates == []
@@ -101,7 +104,7 @@ def test_a_saved_state_goes_on_as_if_never_stopped(tmp_path: Path) -> None:
     tensor, states = counted(23, 5)
     torch.save(states.state_dict(), tmp_path / "state.pt")
     average = Averaging([tensor], 1.0)
-    again = StateChoice(average, 5)
+    again = KeptStates(average, 5)
     again.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
     assert again.candidates == states.candidates == [10, 5]
     for _ in range(17):
@@ -133,14 +136,14 @@ def fitted(
     means: dict[int, list[torch.Tensor]] = {}
 
     def error() -> float:
-        now = part(fit, Averaging).now()
+        now = part(fit, AveragedSteps).now()
         for step, mean in means.items():
             if all(torch.equal(a, b) for a, b in zip(now, mean, strict=True)):
                 return abs(math.log(step / wanted))
         pytest.fail("the tensors are no state of the fit")
 
     def watch(step: int, watchers: object, loss: object) -> None:
-        means[step] = part(fit, Averaging).values()
+        means[step] = part(fit, AveragedSteps).values()
 
     monkeypatch.setattr(StateChoice, "error", lambda choice: error())
     report = SilentReport()
@@ -155,7 +158,9 @@ def test_a_fit_ends_with_the_state_that_draws_validation_frames_best(
 ) -> None:
     fit, avatar, means = fitted(training, monkeypatch, 5)
     assert part(fit, StateChoice).candidates == [10, 5]
-    assert all(torch.equal(a, b) for a, b in zip(part(fit, Averaging).now(), means[5], strict=True))
+    assert all(
+        torch.equal(a, b) for a, b in zip(part(fit, AveragedSteps).now(), means[5], strict=True)
+    )
     assert (avatar.record.steps, avatar.record.chosen_steps) == (20, 5)
     assert "The state of step 5 draws the validation frames best" in capsys.readouterr().err
     again = load_avatar(save_avatar(avatar, tmp_path / "avatar"))
@@ -183,7 +188,7 @@ def test_without_the_choice_a_fit_ends_with_its_last_state(
     fit, avatar, means = fitted(training, monkeypatch, 5, **changes)
     assert avatar.record.chosen_steps is None
     assert all(
-        torch.equal(a, b) for a, b in zip(part(fit, Averaging).now(), means[20], strict=True)
+        torch.equal(a, b) for a, b in zip(part(fit, AveragedSteps).now(), means[20], strict=True)
     )
     assert fit.part(StateChoice) is None
 
@@ -204,7 +209,7 @@ def test_seconds_are_asked_for_once_there_are_states(training: TrainingCapture) 
     fit = make_fit(training, read_settings(FIT), 0, CPU)
     assert part(fit, StateChoice).seconds_now(fit) == 0.0
     for _ in range(10):
-        part(fit, Averaging).take()
+        part(fit, AveragedSteps).take()
         part(fit, StateChoice).take()
     assert part(fit, StateChoice).candidates == [5]
     before = {name: value.clone() for name, value in fit.model.state_dict().items()}

@@ -24,10 +24,9 @@ from wildghand.fitting.colors import FilledColors
 from wildghand.fitting.data import FitData
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.visibility import FewShown, Gaps
-from wildghand.gaussians.training import load_validation_frames
+from wildghand.gaussians.training import LEAST_CHOOSING, load_validation_frames
 from wildghand.model.dress import Gaussians
 from wildghand.model.frames import rasterize_hands
-from wildghand.subject.fit_subject import LEAST_CHOOSING
 from wildghand.visibility import (
     ColorChanges,
     Visibility,

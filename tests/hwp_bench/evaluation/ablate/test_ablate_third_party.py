@@ -13,6 +13,7 @@ from hwp_bench.results import read_results
 
 _MANIFEST = """
 schema = "hwp-method/1"
+training = "none"
 name = "their-method"
 title = "Theirs"
 [entry]

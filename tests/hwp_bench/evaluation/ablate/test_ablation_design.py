@@ -14,6 +14,7 @@ from hwp_bench.methods.manifest import MethodManifest, read_manifest
 
 MANIFEST = """
 schema = "hwp-method/1"
+training = "none"
 name = "mine"
 [entry]
 python = "a:B"

@@ -22,6 +22,7 @@ from hwp_bench.methods.manifest import read_manifest
 
 MANIFEST = """
 schema = "hwp-method/1"
+training = "none"
 name = "wild"
 [entry]
 python = "a:B"

@@ -25,6 +25,7 @@ from hwp_bench.methods.request import ORACLE_INPUTS
 
 _MANIFEST = """
 schema = "hwp-method/1"
+training = "none"
 name = "mean-color"
 title = "Mean colour"
 [entry]

@@ -1,0 +1,52 @@
+"""Tuning by validation frames. Oracles: a score by hand, and the settings of the baselines."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from painted import QUICK, SilentReport
+
+from benchmarks.validation import read_trials, score_fit
+from hwp_bench.base.records import merged
+from hwp_bench.capture import Capture
+from hwp_bench.capture.splits import contiguous_split
+from hwp_bench.cli.options import overrides
+from hwp_bench.methods import find_method, read_manifest
+from hwp_bench.methods.contract import Budget, TrainingCapture
+from hwp_bench.methods.settings import settings_from
+from hwp_bench.metrics.score import score_frame
+from hwp_bench.run.worker import load_entry
+from plain_fit.method import PlainMethod
+
+
+@pytest.mark.parametrize("test", [False, True])
+def test_the_score_is_the_mean_over_frames_that_no_step_saw(
+    make_painted: Callable[..., Capture], make_training: Callable[..., TrainingCapture], test: bool
+) -> None:
+    capture, training = make_painted(), make_training()
+    split = contiguous_split(capture.info.id, capture.info.frame_count)
+    found = score_fit("plain", capture.root, QUICK, Budget(steps=3), 0, test=test)
+    avatar = PlainMethod(QUICK, 0).fit(training, Budget(steps=3), SilentReport())
+    scores = []
+    for frame in (split.test if test else split.validation).tolist():
+        drawn = avatar.render(training.hand_poses(frame), training.camera(frame))[..., :3]
+        mask, exact = capture.scoring_mask(frame)
+        pixels = np.round(255.0 * drawn).astype(np.uint8)
+        scores.append(score_frame(pixels, capture.frame(frame), mask, coverage=exact)["psnr"])
+    assert found == pytest.approx(np.mean(scores), abs=1e-3)
+
+
+@pytest.mark.parametrize("name", read_trials())
+def test_each_baseline_has_as_many_trials_and_all_can_be_run(name: str) -> None:
+    listed: Any = read_trials()[name]
+    assert len(listed["captures"]) == 2
+    assert len(set(listed["trials"])) == 6
+    manifest = read_manifest(find_method(name))
+    kind = load_entry(manifest.root, str(manifest.entry.python)).settings_type
+    smoke = settings_from(kind, manifest.presets["smoke"], name)
+    for text in listed["trials"]:
+        values = merged(manifest.presets["smoke"], overrides(text.split(",")))
+        assert settings_from(kind, values, name) != smoke
