@@ -14,7 +14,9 @@ EXTRAS: dict[str, list[str]] = tomllib.loads((ROOT / "pyproject.toml").read_text
 
 def rows() -> dict[str, str]:
     """What a person gets, by the name of the extra."""
-    section = (ROOT / "docs" / "install.md").read_text("utf-8").split("## Extras\n")[1].split("\n## ")[0]
+    section = (
+        (ROOT / "docs" / "install.md").read_text("utf-8").split("## Extras\n")[1].split("\n## ")[0]
+    )
     found = re.findall(r"^\| `([\w-]+)` \| (.+) \|$", section, re.MULTILINE)
     assert len(found) == len(dict(found))
     return dict(found)

@@ -185,10 +185,10 @@ def joined_data(
             had = both[name].get(key, CaptureData(None))
             others = had.others if had.current == data.current else ()
             if processor and had.current is not None and data.current is not None:
-                kept = tuple(one for one in had.others if one.processor != processor)
-                own = replace(data.current, processor=processor, levels=levels)
-                equal = had.current == data.current
-                data, others = had, kept if equal else (*kept, own)
+                others = tuple(one for one in had.others if one.processor != processor)
+                if had.current != data.current:
+                    others += (replace(data.current, processor=processor, levels=levels),)
+                data = had
             both[name][key] = replace(data, former=had.former, others=others)
     suites = {name: captures for name, captures in both.items() if captures}
     return SuiteData(suites, rendered.renderer)

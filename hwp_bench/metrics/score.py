@@ -173,7 +173,7 @@ def _network_scores(
     inside = crop(region, box)
     scores = {}
     for facts in METRICS:
-        if facts.protocol == protocol.name and facts.needs in pair.networks:
+        if facts.protocol == protocol.name and facts.needs and facts.needs in pair.networks:
             images = (_on_black(image, box, inside) for image in (pair.prediction, pair.target))
             found = np.asarray(pair.networks[facts.needs](*images), np.float64)
             scores[facts.name] = float(found[inside].mean() if found.ndim else found)
