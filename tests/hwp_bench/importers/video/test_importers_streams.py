@@ -401,3 +401,10 @@ def test_what_is_no_file_is_named(
             opens(path)
         with pytest.raises(BadInput, match="does not exist"):
             opens(Path("none.png"))
+
+
+def test_an_encoder_leaves_no_real_time_process(tmp_path: Path) -> None:
+    options = {"preset": "11", "svtav1-params": "lp=1"}
+    write_pictures(tmp_path / "clip.mp4", pictures(COUNT), "libsvtav1", options=options)
+    policies = {os.sched_getscheduler(int(t)) for t in os.listdir("/proc/self/task")}
+    assert policies == {os.SCHED_OTHER}
