@@ -21,7 +21,7 @@ LOSSLESS = {
 
 @contextlib.contextmanager
 def ordinary_priority() -> Iterator[None]:
-    """Undo what SVT-AV1 does to root's processes: real-time ones starve all others on the machine."""
+    """Undo what SVT-AV1 does to a process of root: a real-time one starves the others."""
     try:
         yield
     finally:
