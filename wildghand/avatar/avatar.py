@@ -357,7 +357,12 @@ class WildGHandAvatar(HandAvatar):
         viewmats = None if viewmat is None else self._tensor(viewmat)[None]
         found = {
             side: self.model.gaussians(
-                side, *given, refine=refine, viewmats=viewmats, dark=dark.get(side)
+                side,
+                *given,
+                refine=refine,
+                viewmats=viewmats,
+                dark=dark.get(side),
+                all_around=True,
             )
             for side, given in posed.items()
         }

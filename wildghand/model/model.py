@@ -325,6 +325,7 @@ class WildGHandModel(nn.Module):
         viewmats: Tensor | None = None,
         rows: Tensor | None = None,
         dark: Tensor | None = None,
+        all_around: bool = False,
     ) -> tuple[Gaussians, Hand]:
         """The Gaussians of one hand in any pose, free of perturbations unless frames are named.
 
@@ -338,12 +339,15 @@ class WildGHandModel(nn.Module):
                 with a normal that no training frame has shown is drawn by the fitted light.
             rows: (B,) positions among the training frames, whose biases and gains are added.
             dark: (B, N) factors of the hands' shadows; None: of those that it casts on itself.
+            all_around: the cameras say of the light alone, and the Gaussians are looked at from
+                everywhere.
         """
         hand = pose, betas, transl
         if dark is None:
             dark = self.cast({side: hand}).get(side)
         predicted = self.predict_hand(side, hand, viewmats)
-        return self.dressed(side, predicted, refine=refine, rows=rows, dark=dark, viewmats=viewmats)
+        eyes = None if all_around else viewmats
+        return self.dressed(side, predicted, refine=refine, rows=rows, dark=dark, viewmats=eyes)
 
     def predict_hand(
         self,
