@@ -105,14 +105,7 @@ class Visibility(Found):
         Args:
             chosen: (N,) bool by side, which.
         """
-
-        def kept(shares: Mapping[str, Tensor]) -> dict[str, Tensor]:
-            return {
-                side: torch.where(chosen[side], torch.ones_like(share), share)
-                for side, share in shares.items()
-            }
-
-        return replace(self, offsets=kept(self.offsets), shapes=kept(self.shapes))
+        return self._with(chosen, 1.0)
 
     def spare_all(self) -> Visibility:
         """Keep all of all Gaussians."""
@@ -124,14 +117,15 @@ class Visibility(Found):
         Args:
             unseen: (N,) bool by side, which.
         """
+        return self._with(unseen, 0.0)
 
-        def kept(shares: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def _with(self, chosen: Mapping[str, Tensor], share: float) -> Visibility:
+        def changed(shares: Mapping[str, Tensor]) -> dict[str, Tensor]:
             return {
-                side: torch.where(unseen[side], torch.zeros_like(share), share)
-                for side, share in shares.items()
+                side: values.masked_fill(chosen[side], share) for side, values in shares.items()
             }
 
-        return replace(self, offsets=kept(self.offsets), shapes=kept(self.shapes))
+        return replace(self, offsets=changed(self.offsets), shapes=changed(self.shapes))
 
     def to_tensors(self) -> dict[str, Tensor]:
         """The shares, and whether a wall closes each wrist (1,), as an avatar keeps them."""
