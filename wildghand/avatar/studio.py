@@ -190,9 +190,13 @@ class Studio:
         Args:
             turn: of all of them about the vertical through their middle, degrees.
         """
+        return self.posed_each(dict.fromkeys(self.angles, pose), turn)
+
+    def posed_each(self, poses: Mapping[str, Pose], turn: float = 0.0) -> dict[str, HandPose]:
+        """Return hands in a pose of their own each, by side; see `posed`."""
         turned, hands = Rotation.from_euler("y", turn, degrees=True), {}
-        for side, angles in self.angles.items():
-            vectors = _axis_angles(pose, angles).copy()
+        for side, pose in poses.items():
+            vectors = _axis_angles(pose, self.angles[side]).copy()
             vectors[0] = (turned * Rotation.from_rotvec(vectors[0])).as_rotvec()
             # Rotations leave the wrist where it is, so the translation carries it around.
             wrist = self._wrists[side]

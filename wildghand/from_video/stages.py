@@ -65,8 +65,7 @@ class Turntable:
 
     def view(self, degrees: float) -> np.ndarray:
         """Draw it turned about the vertical, (size, size, 3) uint8; at 0 the palm is in front."""
-        studio = self._avatar.studio
-        hands = {side: studio.posed(pose, degrees)[side] for side, pose in self._poses.items()}
+        hands = self._avatar.studio.posed_each(self._poses, degrees)
         rgba = self._avatar.render(hands, self._camera)
         return as_uint8(rgba[..., :3] + (1.0 - rgba[..., 3:]) * (BACKGROUND / 255.0))
 

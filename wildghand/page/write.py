@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import dataclasses
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -137,15 +137,12 @@ def best_start(
             for side, (_, facing) in seen.items()
         )
 
-    def in_turns(poses: Mapping[str, Pose]) -> Iterator[dict[str, HandPose]]:
-        for turn in _TURNS:
-            yield {side: studio.posed(pose, turn)[side] for side, pose in poses.items()}
-
     rest: dict[str, Pose] = dict.fromkeys(avatar.sides, REST)
     of_clip: list[dict[str, Pose]] = [
         {side: hands[side].pose[1:] for side in avatar.sides} for hands in tried
     ]
-    return max((hands for poses in of_clip or [rest] for hands in in_turns(poses)), key=shown)
+    turned = (studio.posed_each(poses, turn) for poses in of_clip or [rest] for turn in _TURNS)
+    return max(turned, key=shown)
 
 
 def start_of_clip(avatar: WildGHandAvatar, capture: Capture) -> dict[str, HandPose]:
