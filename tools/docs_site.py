@@ -1,24 +1,34 @@
-"""Builds the documentation site: `mkdocs build --strict` reads `mkdocs.yml`, which loads this.
+"""Builds the documentation site: `python -m tools.docs_site OUT` writes `OUT/site` with zensical.
 
-It adds pages that are not files below `docs/` (the README as home, the files at the root that
-contributors read, the page of each baseline, one page of API reference for each public package, and
-one of the tables of scene files), and gives the reference the `#:` comments that document fields
-and constants.
+Next to `docs/` the site has pages that are files elsewhere (the README as home, the files at the
+root that contributors read, a page of each baseline), and pages that are made here: commands,
+settings, suites, scene files, and one page of API reference for each public package. The reference
+shows the `#:` comments that document fields and constants. `mkdocs.yml` configures zensical.
 """
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import importlib
 import inspect
+import os
 import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from griffe import Attribute, Docstring, Extension
-from mkdocs.config.defaults import MkDocsConfig
-from mkdocs.structure.files import File, Files
-from mkdocs.structure.pages import Page
+
+from hwp_bench.cli.main import command_tree, main as hwp_bench
+from hwp_bench.cli.program import Command
+from wildghand.cli.main import command_tree as wildghand_tree, main as wildghand
+from wildghand.model.settings import WildGHandSettings
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -72,23 +82,100 @@ SCENE_TABLES = {
 _LINK = re.compile(r"\]\((?!https?://|#)([^)\s#]+)((?:#[^)\s]*)?)\)")
 
 
-def on_files(files: Files, *, config: MkDocsConfig) -> Files:
-    """Add the pages that are not below `docs/`."""
-    for name, page in ROOT_PAGES.items():
-        text = (ROOT / name).read_text(encoding="utf-8")
-        files.append(File.generated(config, page, content=_from_root(text)))
+def write_pages(docs: Path) -> None:
+    """Write every page of the site into a folder."""
+    shutil.copytree(ROOT / "docs", docs)
+    for path in (*docs.glob("*.md"), *docs.glob("studies/*.md")):
+        text = path.read_text(encoding="utf-8")
+        path.write_text(_LINK.sub(lambda link: _moved(link, "../"), text), encoding="utf-8")
+    pages = {page: _from_root((ROOT / name).read_text("utf-8")) for name, page in ROOT_PAGES.items()}
     for name, page in _baseline_pages().items():
-        text = (ROOT / name).read_text(encoding="utf-8").replace("](../../docs/", "](../")
-        files.append(File.generated(config, page, content=text))
+        pages[page] = (ROOT / name).read_text(encoding="utf-8").replace("](../../docs/", "](../")
     for package in API:
         names = getattr(importlib.import_module(package), "__all__", ())
         public = sorted(set(names) - {"__version__"})
         # A package whose names are lazy lists them in a stub, so they are named here.
         options = f"    options:\n      members: {public}\n" if public else ""
-        text = f"# `{package}`\n\n::: {package}\n{options}"
-        files.append(File.generated(config, f"api/{package}.md", content=text))
-    files.append(File.generated(config, "api/scenes.md", content=_scene_page()))
-    return files
+        pages[f"api/{package}.md"] = f"# `{package}`\n\n::: {package}\n{options}"
+    pages["api/commands.md"] = _commands_page()
+    pages["api/settings.md"] = _settings_page()
+    pages["api/suites.md"] = _suites_page()
+    pages["api/scenes.md"] = _scene_page()
+    for page, text in pages.items():
+        (docs / page).parent.mkdir(exist_ok=True)
+        (docs / page).write_text(text, encoding="utf-8")
+
+
+def build(folder: Path) -> Path:
+    """Write the pages into a folder and build the site from them; a warning ends it."""
+    shutil.rmtree(folder / "docs", ignore_errors=True)
+    write_pages(folder / "docs")
+    config = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    (folder / "mkdocs.yml").write_text(config.replace("$ROOT", str(ROOT)), encoding="utf-8")
+    program = [sys.executable, "-m", "zensical", "build", "--clean", "--strict"]
+    subprocess.run(program, cwd=folder, check=True)
+    return folder / "site"
+
+
+def _commands_page() -> str:
+    """The reference of the command lines: the help of every command."""
+    parts = ["# Commands", "", "The help of every command, as `--help` prints it."]
+    for program, tree, run in (
+        ("hwp-bench", command_tree(), hwp_bench),
+        ("wildghand", wildghand_tree(), wildghand),
+    ):
+        parts += ["", f"## {program}", "", "```text", _printed(run, ["--help"]), "```"]
+        for words in _leaves(tree):
+            help_text = _printed(run, [*words, "--help"])
+            parts += ["", f"### {program} {' '.join(words)}", "", "```text", help_text, "```"]
+    return "\n".join(parts) + "\n"
+
+
+def _leaves(tree: Command) -> Iterator[list[str]]:
+    for name, command in tree.commands.items():
+        if command.commands:
+            yield from ([name, *words] for words in _leaves(command))
+        else:
+            yield [name]
+
+
+def _printed(run: Callable[[list[str]], int], words: list[str]) -> str:
+    """Return what a command prints on a console of 90 columns."""
+    out = StringIO()
+    os.environ["COLUMNS"] = "90"
+    try:
+        with redirect_stdout(out):
+            run(words)
+    except SystemExit:
+        pass
+    return out.getvalue().strip("\n")
+
+
+def _settings_page() -> str:
+    """The reference of WildGHand's settings: every field with its default, range and meaning."""
+    parts = [
+        "# Settings of WildGHand",
+        "",
+        "Give a setting as `--set NAME=VALUE` or in a preset of `method.toml`. A setting of a table"
+        " is `TABLE.NAME`, such as `dpd.enabled`. [Modes](../dpd_pao.md#three-readings) are sets of"
+        " them. Defaults are those of the mode `default`.",
+        "",
+        *_table(WildGHandSettings),
+    ]
+    for field in dataclasses.fields(WildGHandSettings):
+        kind = field.default_factory
+        if dataclasses.is_dataclass(kind):
+            parts += ["", f"## {field.name}", "", *_table(kind)]
+    return "\n".join(parts) + "\n"
+
+
+def _suites_page() -> str:
+    """The reference of suites, captures, methods and metrics, as `hwp-bench list` prints them."""
+    parts = ["# Suites, captures, methods, metrics", "", "As `hwp-bench list` prints them."]
+    for what in ("suites", "captures", "perturbations", "methods", "metrics"):
+        parts += ["", f"## {what.capitalize()}", "", "```text", _printed(hwp_bench, ["list", what])]
+        parts += ["```"]
+    return "\n".join(parts) + "\n"
 
 
 def _scene_page() -> str:
@@ -97,18 +184,13 @@ def _scene_page() -> str:
     for title, name in SCENE_TABLES.items():
         module, _, record = name.rpartition(".")
         kind = getattr(importlib.import_module(f"hwp_bench.sim.{module}"), record)
-        parts += [
-            "",
-            f"## {title}",
-            "",
-            "| field | default | range | meaning |",
-            "| - | - | - | - |",
-        ]
-        parts += _field_rows(kind)
+        parts += ["", f"## {title}", "", *_table(kind)]
     return "\n".join(parts) + "\n"
 
 
-def _field_rows(record: type) -> list[str]:
+def _table(record: Any) -> list[str]:
+    """The fields of a dataclass as a table."""
+    head = ["| field | default | range | meaning |", "| - | - | - | - |"]
     source = re.findall(r"((?:^    #: .*\n)+)    (\w+):", inspect.getsource(record), re.MULTILINE)
     meanings = {name: " ".join(comment.replace("#:", "").split()) for comment, name in source}
     hints = get_type_hints(record, include_extras=True)
@@ -123,12 +205,14 @@ def _field_rows(record: type) -> list[str]:
             shown = f"`{default}`" if plain else ""
         meaning = meanings.get(field.name, "").replace("|", "\\|")
         rows.append(f"| `{field.name}` | {shown} | {_range(field, hints)} | {meaning} |")
-    return rows
+    return head + rows
 
 
 def _range(field: dataclasses.Field[Any], hints: dict[str, Any]) -> str:
     if field.metadata.get("range"):
         return "{:g} to {:g}".format(*field.metadata["range"])
+    if field.metadata.get("choices"):
+        return ", ".join(f"`{word}`" for word in field.metadata["choices"])
     hint = hints[field.name]
     for part in (hint, *get_args(hint)):
         if get_origin(part) is Literal:
@@ -138,13 +222,6 @@ def _range(field: dataclasses.Field[Any], hints: dict[str, Any]) -> str:
             low, high = bounds[0].ge, bounds[0].le
             return f"{low:g} to {high:g}" if high < 1e9 else f"from {low:g}"
     return ""
-
-
-def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Lead links from `docs/` to the pages that were added."""
-    if page.file.generated_by:
-        return markdown
-    return _LINK.sub(lambda link: _moved(link, "../"), markdown)
 
 
 def _baseline_pages() -> dict[str, str]:
@@ -180,3 +257,9 @@ class FieldComments(Extension):
         ]
         if comments:
             attr.docstring = Docstring("\n".join(comments), lineno=first + 1, parent=attr)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("out", type=Path, help="folder for pages and site")
+    print(build(parser.parse_args().out))
