@@ -37,6 +37,7 @@ ROOT_PAGES = {
     "README.md": "index.md",
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
+    "CODE_OF_CONDUCT.md": "code_of_conduct.md",
 }
 #: Packages with a page of reference; what their `__all__` lists is the public interface.
 API = (
