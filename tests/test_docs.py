@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import ast
 import re
 import shlex
 from collections.abc import Callable
@@ -16,7 +17,10 @@ from wildghand.cli.main import command_tree as wildghand_tree
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [
-    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")),
+    *(
+        ROOT / name
+        for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "CODE_OF_CONDUCT.md")
+    ),
     *sorted((ROOT / "docs").glob("*.md")),
     *sorted((ROOT / "docs" / "studies").glob("*.md")),
     *sorted((ROOT / "baselines").glob("*/README.md")),
@@ -113,10 +117,26 @@ def is_defined(name: str) -> bool:
             )
             if file.is_file():
                 text = file.read_text(encoding="utf-8")
+                if (stub := file.with_suffix(".pyi")).is_file():
+                    text += stub.read_text(encoding="utf-8")
                 return all(re.search(rf"\b{part}\b", text) for part in parts[count:])
             if base.is_dir() and count == len(parts):
                 return True
     return False
+
+
+def test_messages_of_the_page_of_troubles_are_those_of_the_programs() -> None:
+    page = (ROOT / "docs" / "troubleshooting.md").read_text("utf-8")
+    messages = re.findall(r"^\| `([^`]+)` \|", page, re.MULTILINE)
+    assert len(messages) >= 20
+    said = []
+    for folder in ("hwp_bench", "wildghand"):
+        for path in (ROOT / folder).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+                if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                    said.append(node.value)
+    # A message with values consists of the parts between them.
+    assert [text for text in messages if not any(text in part for part in said)] == []
 
 
 @pytest.mark.parametrize(

@@ -1,45 +1,25 @@
-"""The documentation site builds without a warning, and stands alone. Oracles: mkdocs, its pages."""
+"""The site of the documentation builds without a warning and stands alone. Oracle: its pages."""
 
 from __future__ import annotations
 
 import importlib
 import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import yaml
 
-ROOT = Path(__file__).resolve().parents[1]
-PACKAGES = (
-    "hwp_bench",
-    "hwp_bench.capture",
-    "hwp_bench.hands",
-    "hwp_bench.methods",
-    "hwp_bench.metrics",
-    "hwp_bench.results",
-    "wildghand",
-    "wildghand.splat",
-)
+from tools.docs_site import API, build
 
+ROOT = Path(__file__).resolve().parents[1]
 pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The built site; in strict mode a link or an anchor that leads nowhere ends the build."""
-    folder = tmp_path_factory.mktemp("site") / "site"
-    done = subprocess.run(
-        [sys.executable, "-m", "mkdocs", "build", "--strict", "-d", str(folder)],
-        cwd=ROOT,
-        env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    return folder
+    return build(tmp_path_factory.mktemp("site"))
 
 
 def test_every_page_of_docs_is_there(site: Path) -> None:
@@ -47,10 +27,11 @@ def test_every_page_of_docs_is_there(site: Path) -> None:
     assert len(pages) > 15
     assert {page for page in pages if not (site / f"{page}.html").is_file()} == set()
     assert "Cite it" in (site / "index.html").read_text(encoding="utf-8")
-    assert "glossary" in (site / "contributing.html").read_text(encoding="utf-8")
+    assert "oracle of a test" in (site / "contributing.html").read_text(encoding="utf-8")
+    assert 'href="glossary.html"' in (site / "start.html").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("package", PACKAGES)
+@pytest.mark.parametrize("package", API)
 def test_the_reference_has_every_public_name(site: Path, package: str) -> None:
     page = (site / "api" / f"{package}.html").read_text(encoding="utf-8")
     names = getattr(importlib.import_module(package), "__all__", [])
@@ -72,6 +53,20 @@ def test_the_fields_of_scene_files_are_listed(site: Path) -> None:
     assert cells[row + 1 : row + 3] == ["0.0", "0 to 3"]
     assert cells[cells.index("frame_count") + 1] == "required"
     assert all(cells[3::4]), "every field has a meaning"
+
+
+def test_commands_settings_and_suites_are_listed(site: Path) -> None:
+    commands = (site / "api" / "commands.html").read_text(encoding="utf-8")
+    for words in ("hwp-bench evaluate", "hwp-bench data import video", "wildghand fit"):
+        assert f'id="{words.replace(" ", "-")}"' in commands
+        assert commands.count(words) > 3
+    settings = (site / "api" / "settings.html").read_text(encoding="utf-8")
+    cells = re.findall(r"<td>(.*?)</td>", settings, re.DOTALL)
+    cells = [re.sub("<[^>]+>", "", cell) for cell in cells]
+    row = cells.index("identity_resolution")
+    assert cells[row + 1 : row + 3] == ["160", "4 to 4096"]
+    assert all(cells[3::4]), "every setting has a meaning"
+    assert "wild-test" in (site / "api" / "suites.html").read_text(encoding="utf-8")
 
 
 def test_no_page_loads_anything_from_elsewhere(site: Path) -> None:

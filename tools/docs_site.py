@@ -17,7 +17,7 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import redirect_stdout
 from io import StringIO
 from pathlib import Path
@@ -25,9 +25,11 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from griffe import Attribute, Docstring, Extension
 
-from hwp_bench.cli.main import command_tree, main as hwp_bench
+from hwp_bench.cli.main import command_tree
+from hwp_bench.cli.main import main as hwp_bench
 from hwp_bench.cli.program import Command
-from wildghand.cli.main import command_tree as wildghand_tree, main as wildghand
+from wildghand.cli.main import command_tree as wildghand_tree
+from wildghand.cli.main import main as wildghand
 from wildghand.model.settings import WildGHandSettings
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -86,10 +88,15 @@ _LINK = re.compile(r"\]\((?!https?://|#)([^)\s#]+)((?:#[^)\s]*)?)\)")
 def write_pages(docs: Path) -> None:
     """Write every page of the site into a folder."""
     shutil.copytree(ROOT / "docs", docs)
+    terms = glossary_terms((docs / "glossary.md").read_text(encoding="utf-8"))
     for path in (*docs.glob("*.md"), *docs.glob("studies/*.md")):
-        text = path.read_text(encoding="utf-8")
-        path.write_text(_LINK.sub(lambda link: _moved(link, "../"), text), encoding="utf-8")
-    pages = {page: _from_root((ROOT / name).read_text("utf-8")) for name, page in ROOT_PAGES.items()}
+        text = _LINK.sub(lambda link: _moved(link, "../"), path.read_text(encoding="utf-8"))
+        if path.parent == docs and path.name not in {"glossary.md", "ablation.md"}:
+            text = link_terms(text, terms)
+        path.write_text(text, encoding="utf-8")
+    pages = {
+        page: _from_root((ROOT / name).read_text("utf-8")) for name, page in ROOT_PAGES.items()
+    }
     for name, page in _baseline_pages().items():
         pages[page] = (ROOT / name).read_text(encoding="utf-8").replace("](../../docs/", "](../")
     for package in API:
@@ -105,6 +112,30 @@ def write_pages(docs: Path) -> None:
     for page, text in pages.items():
         (docs / page).parent.mkdir(exist_ok=True)
         (docs / page).write_text(text, encoding="utf-8")
+
+
+def glossary_terms(page: str) -> list[str]:
+    """The words that a glossary explains, the longest first."""
+    terms = re.findall(r"^\| (\w[\w -]*) \| (?!meaning)", page, re.MULTILINE)
+    return sorted(terms, key=len, reverse=True)
+
+
+def link_terms(page: str, terms: Sequence[str]) -> str:
+    """Link the first use of each term in the paragraphs of a page to the glossary."""
+    lines, code, left = [], False, list(terms)
+    for line in page.split("\n"):
+        code ^= line.lstrip().startswith("```")
+        if not (code or line.startswith(("#", "|", "<", "![", "    "))):
+            for term in list(left):
+                # Spans of code and links are left alone.
+                pattern = rf"(`[^`]*`|!?\[[^\]]*\]\([^)]*\))|(?<![\w-])({term}s?)(?![\w-])"
+                uses = [use for use in re.finditer(pattern, line, re.IGNORECASE) if use[2]]
+                if uses:
+                    start, end = uses[0].span()
+                    line = f"{line[:start]}[{uses[0][2]}](glossary.md){line[end:]}"
+                    left.remove(term)
+        lines.append(line)
+    return "\n".join(lines)
 
 
 def build(folder: Path) -> Path:
