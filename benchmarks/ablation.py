@@ -2,7 +2,7 @@
 
 Run from the repository: `python -m benchmarks.ablation FOLDER` fits and writes `FOLDER/page.md`;
 `--page docs/ablation.md` writes the page of the documentation, its pictures into
-`docs/pictures/ablation`. `--page-only` fits nothing. A study that was stopped goes on where it was:
+`docs/pictures/ablation`. `--page-only` fits nothing. A stopped study continues:
 its parts are ablations of `hwp-bench ablate`, which takes finished jobs as they are.
 
 Parts: `cross` (DPD x PAO x pre-pass), `paper` and `released` (DPD x PAO in these modes), and
@@ -120,7 +120,7 @@ def run(folder: Path, study: Study, jobs: int) -> None:
 
 @dataclass(frozen=True)
 class Part:
-    """One ablation as far as it is there."""
+    """The finished parts of one ablation."""
 
     suite: str
     name: str

@@ -3,7 +3,7 @@
 Run from the repository:
 `python -m benchmarks.field --suites wild-test mini --seeds 3 --seconds 64 -o runs/field --jobs 2`
 evaluates the methods of `baselines/` and WildGHand suite by suite, with `hwp-bench evaluate`, which
-gets every other argument. Started again it goes on where it was stopped.
+gets every other argument. Started again it continues where it was stopped.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The loops of two fits that take turns, so that other work on the machine slows both alike.
 
 The plain baseline's own loop runs from its first step to its last; whenever it reports that it has
-taken a block of steps, blocks of WildGHand's loop are taken before it goes on. Both are what a user
+taken a block of steps, blocks of WildGHand's loop follow before it continues. Both are what a user
 runs, with everything that they do between steps.
 """
 

@@ -3,7 +3,7 @@
 The resamples give a standard error, which is read with Student's t. With a long tail in the
 captures' differences Student's interval covers too rarely: a few captures seldom show the tail,
 and then both the mean and the spread are small. Hall's transformation moves both ends towards the
-tail. An interval that reaches as far as either of the two covers often enough, and where nothing
+tail. An interval that reaches the farther of the two covers often enough, and where nothing
 is skewed not much too often (`python -m benchmarks.coverage`).
 """
 

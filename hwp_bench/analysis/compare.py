@@ -414,7 +414,7 @@ def contrast_columns(found: Sequence[Contrast], metric: str, better: str) -> lis
 
 
 def one_capture_notes(found: Sequence[Contrast]) -> list[str]:
-    """Return what is said under a table that has scopes of one capture."""
+    """Return the notes under a table that has scopes of one capture."""
     return [ONE_CAPTURE] if any(item.estimate.captures == 1 for item in found) else []
 
 

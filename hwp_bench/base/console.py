@@ -183,7 +183,7 @@ def _reader_gone(stream: TextIO) -> bool:
 
 
 def tell(text: str) -> None:
-    """Print a line on standard error; where it cannot be printed, the work goes on without."""
+    """Print a line on standard error; where it cannot be printed, the work continues without."""
     stream = sys.stderr
     if stream is None or stream.closed:
         return
@@ -194,7 +194,7 @@ def tell(text: str) -> None:
 
 
 def on_terminal(stream: TextIO | None) -> bool:
-    """Whether a stream is a terminal; one that is closed is none."""
+    """Whether a stream is a terminal; not one that is closed."""
     return stream is not None and not stream.closed and stream.isatty()
 
 
@@ -215,7 +215,7 @@ FOUND = 0.1
 def notice(text: str) -> None:
     """Print a line for a person on standard error; what could steer a terminal becomes `?`.
 
-    Where nobody reads it any more it is dropped, and the work goes on.
+    Where nobody reads it any more it is dropped, and the work continues.
     """
     tell(shown(text))
 

@@ -66,7 +66,7 @@ UNLOCKED_SECONDS = 24 * 3600.0
 def scratch_folder(prefix: str) -> Iterator[Path]:
     """Make a folder in the system's temporary folder, and remove it in the end.
 
-    Those of the same prefix that killed processes of this user have left are removed first. The
+    Folders of the same prefix that killed processes of this user left are removed first. The
     system lets go of a killed process's lock, so that no folder in use is taken for one of them.
     """
     from filelock import FileLock

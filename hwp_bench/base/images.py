@@ -203,7 +203,7 @@ def _write_jpeg(path: Path, pixels: np.ndarray) -> Path:
 
 
 def _is_whole(file: Path) -> bool:
-    """Whether an image that was just written has its end: its library misses a full disc."""
+    """Whether a written image is complete: its library does not notice a full disc."""
     try:
         with file.open("rb") as stream:
             head, size = stream.read(6), stream.seek(0, os.SEEK_END)

@@ -97,7 +97,7 @@ def helper(function: Callable[..., Any], **options: Any) -> Any:
 
 
 def on_disk(dispatcher: Any) -> bool:
-    """Return whether the disk holds machine code of a compiled function, as far as can be told."""
+    """Return whether the disk holds machine code of a compiled function, by what can be checked."""
     cache = getattr(dispatcher, "_cache", None)
     return isinstance(cache, MachineCode) and cache.on_disk()
 
@@ -156,7 +156,7 @@ class MachineCode:
         return str(code_folder())
 
     def on_disk(self) -> bool:
-        """Whether the disk holds a version of this function, as far as can be told."""
+        """Whether the disk holds a version of this function, by what can be checked."""
         prefix = self._prefix()
         places = [] if prefix is None else _folders()
         return any(any(folder.glob(f"{prefix}-*{_SUFFIX}")) for folder in places)

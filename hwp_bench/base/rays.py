@@ -258,7 +258,7 @@ def _cast(call: Any, scene: int, origins: np.ndarray, directions: np.ndarray) ->
 
 
 def ray_mesh(vertices: np.ndarray, faces: np.ndarray) -> EmbreeMesh:
-    """Make a mesh, vertices (V, 3) m and faces (F, 3), ready to be asked what rays meet."""
+    """Make a mesh, vertices (V, 3) m and faces (F, 3), ready for queries of rays."""
     loaded = library()
     return EmbreexMesh(vertices, faces) if loaded is None else EmbreeMesh(loaded, vertices, faces)
 

@@ -330,7 +330,7 @@ class _Drawing:
         self.widths = self._widths()
 
     def parts(self) -> Iterator[Any]:
-        """What `rich` prints: the caption, the blocks, and what is said under them."""
+        """What `rich` prints: the caption, the blocks, and the notes under them."""
         from rich.text import Text
 
         yield Text(self.fit(self.table.caption), "italic")

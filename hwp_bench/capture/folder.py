@@ -246,7 +246,7 @@ def open_capture(path: str | os.PathLike[str]) -> Capture:
     Raises:
         BadCapture: not a capture folder, or its metadata is wrong; file and field are named.
         BadInput: hand parameters or cameras are damaged, not finite, or of another length.
-        UsageError: the path is none.
+        UsageError: it is not a path.
     """
     root = place(path, "path")
     if not (root / METADATA).is_file():

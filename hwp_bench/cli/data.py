@@ -192,7 +192,7 @@ hwp needs huggingface_hub: pip install 'hwp-bench[hub]'. Run the same command ag
 interrupted download. Checksums are pinned on first use; existing files are never replaced.
 
 real-1 needs the tracker: pip install 'hwp-bench[track]'. Its clips are downloaded, checked by their
-SHA-256, tracked and imported into the cache. Exit status 1: a clip could not be had.
+SHA-256, tracked and imported into the cache. Exit status 1: a clip is not available.
 """
 
 

@@ -48,7 +48,7 @@ Several methods or seeds have a folder each, OUT/METHOD/seed-N; one table at the
 and `hwp-bench table OUT` shows others. A method that cannot be run is named and left out.
 
 An evaluation that is started again with the same arguments keeps finished captures. A folder with
-results of other arguments is refused, and what differs is said; with --overwrite they are
+results of other arguments is refused, with what differs; with --overwrite they are
 replaced once all new ones are there.
 Exit status 0: every frame was scored; 1: the method failed on a capture or left out frames
 (they get the protocol's penalty); 2: the command line is wrong.

@@ -239,7 +239,7 @@ def _add_interhand26m(parser: argparse.ArgumentParser) -> None:
     _add_size(parser)
     fps = "frame rate of the annotated frames, 5 or 30 (default: 5)"
     add("--fps", type=float, default=5.0, help=fps)
-    _add_side(parser, "those that the sequence is said to show")
+    _add_side(parser, "those that the sequence is listed with")
     add_force(parser)
     add_json(parser, "print the facts as JSON")
 

@@ -162,7 +162,7 @@ def overrides(texts: Iterable[str]) -> dict[str, Any]:
             if not isinstance(error.__cause__, tomllib.TOMLDecodeError):
                 raise
             if value.lstrip()[:1] in _OPENING:
-                problem = f"begins as TOML and is none ({error.__cause__})"
+                problem = f"looks like TOML and is not ({error.__cause__})"
                 remedy = "Close it; a text that begins so is written in quotation marks."
                 raise UsageError(problem, where="--set", field=place, remedy=remedy) from error
             if has_odd_characters(value):

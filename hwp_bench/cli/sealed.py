@@ -33,7 +33,7 @@ _MAKE = """examples:
 
 exam/publication/public goes to authors; publish exam/publication/public/suite.json before anybody
 submits, because it binds you. exam/keeper holds the secret and the captures, and
-exam/publication/sealed the test frames: keep both. A start that was stopped goes on.
+exam/publication/sealed the test frames: keep both. A start that was stopped continues.
 """
 _REVEAL = """examples:
   hwp-bench sealed reveal exam -o revealed.json

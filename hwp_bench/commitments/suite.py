@@ -107,7 +107,7 @@ def make_suite(
     engine: Engine | None = None,
     needs: Needs | None = None,
 ) -> SealedSuite:
-    """Make a sealed suite in a folder; started again it goes on where it was stopped."""
+    """Make a sealed suite in a folder; started again it continues where it was stopped."""
     folder = Path(out)
     refuse_existing(folder / PUBLICATION)
     keeper = folder / KEEPER

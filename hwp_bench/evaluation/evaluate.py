@@ -1,6 +1,6 @@
 """Evaluate a method on a set of captures: checks before any work, plans, the loop over captures.
 
-Whatever is wrong with a call is said before a suite is rendered for minutes (`check_call`,
+Whatever is wrong with a call is reported before a suite is rendered for minutes (`check_call`,
 `check_suite`).
 """
 
@@ -132,7 +132,7 @@ def run_plans(
     """Run what is missing of some plans, each in a folder below `out`, with the lock of `out`.
 
     A capture's result is on disk before the next begins. Results of the same key are taken as they
-    are, and that is said; results of another evaluation are refused, or stay until all new ones
+    are, with a message; results of another evaluation are refused, or stay until all new ones
     are whole (`overwrite`).
     """
     with exclusive(out):
@@ -307,7 +307,7 @@ def check_call(
     *,
     overwrite: bool = False,
 ) -> None:
-    """Refuse a call that cannot work, as far as it can be told from the call alone."""
+    """Refuse a call that cannot work, where the call alone shows it."""
     check_settings(manifest, settings.run.settings, field)
     manifest.preset(settings.preset, settings.suite)
     if settings.run.frames not in FRAME_CHOICES and ":" not in settings.run.frames:

@@ -330,7 +330,7 @@ def _remove_ours(folder: Path) -> None:
 
 @contextlib.contextmanager
 def _interrupts_later() -> Iterator[None]:
-    """Let Ctrl-C and SIGTERM wait for the end of a block that takes a moment."""
+    """Hold back Ctrl-C and SIGTERM until the end of a short block."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -329,7 +329,7 @@ def read_annotations(
 ) -> InterHandRecords:
     """Read the annotations of one camera of one sequence.
 
-    `side` is `right`, `left` or `both`; `auto`: the hands that the sequence is said to show. MANO
+    `side` is `right`, `left` or `both`; `auto`: the hands that the sequence is listed with. MANO
     parameters that are not needed (`mano`) are read where they are.
     """
     files = _Annotations(root, sequence)

@@ -173,7 +173,7 @@ def method_rows(entries: Sequence[Entry]) -> list[BoardRow]:
     """Return one row for each method, in the order in which the methods come.
 
     A method whose entries were all withdrawn has none. The row of a method is whole where one is,
-    checked as far as one is, and of these the newest.
+    checked the furthest, and of these the newest.
     """
     methods: dict[object, list[Entry]] = {}
     for entry in entries:

@@ -123,7 +123,7 @@ class Check:
         if self.cross_checked > self.frames:
             raise UsageError("is more than the frames", field="cross_checked")
         if self.kind == "rescored" and (self.rerun is not None or self.scores):
-            raise UsageError("belongs to a second run, and this is none", field="rerun")
+            raise UsageError("belongs to a second run, which this is not", field="rerun")
         if self.kind == "re-run" and (self.rerun is None or "psnr" not in self.scores):
             raise UsageError("must have the digest and PSNR of the second run", field="rerun")
         if bool(self.overrules) != bool(self.reason):

@@ -473,7 +473,7 @@ def _check_overruling(entry: Entry, check: Check) -> None:
 
 
 def without_false_checks(entry: Entry, now: datetime | None = None) -> Entry:
-    """Return the entry without checks and contests that are false; each of them is said."""
+    """Return the entry without checks and contests that are false; each is reported."""
     kept: list[Check | Contest] = []
     for check in entry.additions:
         try:

@@ -71,7 +71,7 @@ class CaptureData:
 
 @dataclass(frozen=True)
 class SuiteData:
-    """The data of every suite, as far as it is known."""
+    """The known data of every suite."""
 
     #: By suite and capture id.
     suites: dict[Line, dict[Line, CaptureData]]

@@ -112,7 +112,7 @@ def scored_pixels(mask: np.ndarray, *, erosion: int, coverage: bool = False) -> 
 
     A quarter of the squared error otherwise sits in border pixels that mix hand and
     background, and measures the background. The mask loses `erosion` pixels at its border, to all
-    eight neighbours; the frame's border takes nothing away, because the hand goes on behind it.
+    eight neighbours; the frame's border takes nothing away, because the hand continues behind it.
     With `coverage` the mask says which share of a pixel the hand covers (255 = all): then the
     pixels at 255 are taken as they are, without erosion.
     """

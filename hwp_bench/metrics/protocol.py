@@ -28,7 +28,7 @@ class SsimSettings:
     sigma: float
     #: True: covariances are divided by N - 1 (scikit-image's default); False: by N.
     sample_covariance: bool
-    #: Difference between the largest and the smallest value that a pixel is said to take.
+    #: Difference between the largest and the smallest value that a pixel is assumed to take.
     data_range: float
     #: Constant of the luminance term: C1 = (k1 * data_range)^2.
     k1: float = 0.01

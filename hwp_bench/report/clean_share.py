@@ -133,7 +133,7 @@ def _of_its_captures(result: Results) -> Results:
 def _behind(
     values: Mapping[str, np.ndarray], reference: Mapping[str, np.ndarray]
 ) -> Estimate | None:
-    """The paired difference over the captures that both have, if their seeds are as many."""
+    """The paired difference over the captures of both, if they have as many seeds."""
     pairs = [(own, reference[key]) for key, own in values.items() if key in reference]
     if not pairs or any(own.shape != other.shape for own, other in pairs):
         return None

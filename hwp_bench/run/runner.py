@@ -157,7 +157,7 @@ def rehearse_method(
     time_limit: float = DEFAULT_TIME_LIMIT,
     confinement: Confinement | None = None,
 ) -> None:
-    """Make a Python method with its settings and do no more, as `run_method` would begin.
+    """Make a Python method with its settings and stop there, as `run_method` would begin.
 
     What fails here would fail on every capture: an import, a setting's value, a device. Of a
     command it is looked whether its program is there.

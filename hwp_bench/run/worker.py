@@ -156,7 +156,7 @@ def run(training: TrainingCapture, factory: MethodFactory, output: Path) -> None
 
 
 def render_free_views(avatar: Avatar, training: TrainingCapture, folder: Path) -> None:
-    """Render the free-view clip, if there is one; a frame that fails costs itself and no more."""
+    """Render the free-view clip, if there is one; a frame that fails costs only itself."""
     views = training.free_views
     if views is None:
         return

@@ -254,7 +254,7 @@ class ObjectInteraction(Effect):
         changed = dict(hands)
         for side, key in by_side(self.stage).items():
             goal, track = moment_of_key(key), hands[side]
-            # The wander of the track goes on, so that a staged hand is not frozen.
+            # The wander of the track continues, so that a staged hand is not frozen.
             goal = HandMoment(
                 goal.angles + 0.15 * (track.angles - goal.angles),
                 goal.place + 0.1 * (track.place - goal.place),

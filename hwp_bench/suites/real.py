@@ -103,7 +103,7 @@ class RealClip:
             folder: its files are looked at in place of the network, whatever they are called.
 
         Raises:
-            HwpError: it cannot be had.
+            HwpError: it is not available.
             BadInput: the download is another file.
         """
         video = cache_root() / "real" / "videos" / f"{self.id}-{self.sha256[:12]}"
@@ -193,7 +193,7 @@ def ensure_clips(name: str, folder: Path | None = None) -> tuple[list[Path], Map
         The capture folders, in the suite's order, and why a clip is not among them, by its id.
 
     Raises:
-        HwpError: not one clip could be had, or an import failed.
+        HwpError: no clip is available, or an import failed.
         MissingDependency: the tracker is not installed.
     """
     if folder is not None and not folder.is_dir():
@@ -212,7 +212,7 @@ def ensure_clips(name: str, folder: Path | None = None) -> tuple[list[Path], Map
         found.append(clip.ensure(video))
     if not found:
         raise HwpError(
-            f"no clip of {name} could be had",
+            f"no clip of {name} is available",
             remedy=f"With the network run `hwp-bench data get {name}`; or give its files with "
             f"`hwp-bench data get {name} --from FOLDER`.",
         )

@@ -71,7 +71,7 @@ def ensure_suite(
         needs: what one render takes of a machine.
 
     Returns:
-        The capture folders, in the suite's order. Real clips that cannot be had are left out by
+        The capture folders, in the suite's order. Real clips that are not available are left out by
         name.
 
     Raises:

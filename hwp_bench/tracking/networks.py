@@ -112,7 +112,7 @@ def _box_overlap(
 def cut_region(image: np.ndarray, region: Region, edge: int, *, outside_black: bool) -> np.ndarray:
     """Resample a region, which may reach beyond its image, into a square: (edge, edge, 3) uint8.
 
-    What lies outside the image is black, or the image's edge goes on. Position (0, 0) is the
+    What lies outside the image is black, or the image's edge continues. Position (0, 0) is the
     region's first corner, as in MediaPipe's ImageToTensorCalculator, which samples bilinearly and
     does not smooth.
     """

@@ -189,7 +189,7 @@ class WildGHandAvatar(HandAvatar):
     """See `hwp_bench.methods.contract.Avatar`.
 
     Args:
-        model: what is drawn; while a fit goes on it may be the live one.
+        model: what is drawn; while a fit runs it may be the live one.
         settings: how it was fitted.
         hand_model: the hand model whose parameters it takes.
         betas: (10,) of each hand as it was fitted, by side.
@@ -262,7 +262,7 @@ class WildGHandAvatar(HandAvatar):
             (H, W, 4) float32 in [0, 1]: sRGB colour over black (premultiplied) and coverage.
 
         Raises:
-            UsageError: no hand, one that was not fitted, or a pose that is none.
+            UsageError: no hand, one that was not fitted, or no pose.
         """
         if camera is None:
             check_edge(size)
@@ -286,7 +286,7 @@ class WildGHandAvatar(HandAvatar):
             background: sRGB, 0 to 255.
 
         Raises:
-            UsageError: a pose that is none, or a size out of range.
+            UsageError: not a pose, or a size out of range.
         """
         check_edge(size)
         turns = [360.0 * frame / TURN_FRAMES for frame in range(TURN_FRAMES)]

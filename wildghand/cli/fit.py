@@ -48,7 +48,7 @@ _FIT_EXAMPLES = """examples:
 
 A video of hands becomes an avatar folder with turntable.mp4 and sheet.jpg; what leads to them
 is in its folder `work`. Tracking needs ai-edge-litert: pip install 'hwp-bench[track]'. A capture
-is a folder (`hwp-bench data import-video`, `hwp-bench sim render`). A stopped fit goes on when
+is a folder (`hwp-bench data import-video`, `hwp-bench sim render`). A stopped fit continues when
 the same command is given again. With torchrun each process draws its part of every batch, on a
 GPU of its own.
 """
@@ -206,7 +206,7 @@ _PRETRAIN_EXAMPLES = """examples:
   wildghand fit dora -o dora_avatar --prior my_prior
 
 Give captures of several people, one or more of each, and none that a score will be taken on. A
-stopped run goes on when the same command is given again.
+stopped run continues when the same command is given again.
 """
 
 

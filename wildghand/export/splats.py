@@ -239,7 +239,7 @@ def scaled(splats: PosedGaussians, factor: float) -> PosedGaussians:
 
 
 def require_scale(factor: float) -> None:
-    """Refuse a scale that is none."""
+    """Refuse a scale that is not one."""
     if not (np.isfinite(factor) and factor > 0.0):
         raise UsageError(f"is {factor}", field="--scale", remedy="Use a number above 0.")
 

@@ -80,8 +80,8 @@ class StartColors(Component):
 class FilledColors:
     """The colours that places take which few frames have shown or none.
 
-    The network's colours of such places are nobody's: they began as the prior's and went where the
-    weights went that other places moved, which leaves blotches. Both hands of a person look alike:
+    The network's colours of such places are unconstrained: they began as the prior's and followed
+    the weights that other places moved, which leaves blotches. Both hands of a person look alike:
     what is known of the same place of the other hand comes first. Then what is known of the skin is
     carried on as smoothly as can be.
     """
@@ -286,7 +286,7 @@ def smooth_fill(rough: Any, values: np.ndarray, known: np.ndarray) -> np.ndarray
     """Carry values on from where they are known to where they are not.
 
     The filled values x are smooth and near what is known: they minimise the sum of known (x - v)^2
-    + 0.3 roughness(x). A value keeps its own part as far as it is known, and takes the rest from x.
+    + 0.3 roughness(x). A value keeps its own part where it is known, and takes the rest from x.
 
     Args:
         values: (N, C).

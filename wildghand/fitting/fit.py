@@ -127,7 +127,7 @@ class Component:
         return avatar
 
     def seconds(self, fit: Fit) -> float:
-        """About how long `after` takes, kept back from a budget; nothing of the fit changes."""
+        """About how long `after` takes, reserved in a budget; nothing of the fit changes."""
         return 0.0
 
     def seconds_now(self, fit: Fit) -> float:
@@ -352,7 +352,7 @@ class Fit(IterativeFit[WildGHandAvatar]):
         return self.avatar(steps, seconds, final=self.world.is_main)
 
     def agree(self, fraction: float) -> float:
-        """All processes go by the clock of rank 0, or some would stop a step before the others."""
+        """All processes follow the clock of rank 0, or some would stop a step before the others."""
         return self.world.broadcast(fraction)
 
     def tell(self, text: str) -> None:
@@ -373,7 +373,7 @@ class Fit(IterativeFit[WildGHandAvatar]):
         self.world.require_same(digest_of(numbers, step))
 
     def avatar(self, steps: int, seconds: float = 0.0, *, final: bool = False) -> WildGHandAvatar:
-        """The avatar as it stands; it goes on changing with the fit.
+        """The avatar as it stands; it keeps changing with the fit.
 
         Args:
             steps: optimizer steps behind it.

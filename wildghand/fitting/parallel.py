@@ -260,5 +260,5 @@ def _talking() -> Iterator[None]:
     except RuntimeError as error:
         raise PeerLost(
             "another process of the fit ended or cannot be reached",
-            remedy="The same command goes on with the state that was saved last.",
+            remedy="The same command continues with the state that was saved last.",
         ) from error

@@ -1,6 +1,6 @@
-"""A fit from a capture folder to an avatar, which can be stopped and goes on.
+"""A fit from a capture folder to an avatar, which can be stopped and continues.
 
-The state of an unfinished fit lies on disk, so that a stopped one goes on as if it had not been.
+The state of an unfinished fit lies on disk, so that a stopped one continues as if it had not been.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ def fit_capture(
 ) -> WildGHandAvatar:
     """Fit an avatar to a capture, and write it if a folder is named.
 
-    With `out` the state is saved next to it every 20 seconds. The same call goes on with it after
+    With `out` the state is saved next to it every 20 seconds. The same call continues with it after
     a stop, and takes the avatar as it is where it was finished; with a budget in steps the result
     is that of a fit that was never stopped.
 
@@ -293,7 +293,7 @@ def _check_digest(state: Mapping[str, Any], digest: str, file: Path) -> None:
         raise BadInput(
             "belongs to another capture, other settings or another seed",
             where=file,
-            remedy="Give the same arguments to go on with it, or remove it to start again.",
+            remedy="Give the same arguments to continue with it, or remove it to start again.",
         )
 
 

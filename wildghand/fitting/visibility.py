@@ -1,4 +1,4 @@
-"""Gaussians that few frames have shown: discs on the skin, as far as validation frames agree.
+"""Gaussians that few frames have shown: discs on the skin, where validation frames agree.
 
 Those that no frame shows are discs from where the camera never stood, in the colours of the skin
 around them. From behind they are as they were learnt: they shine through the skin that frames show.

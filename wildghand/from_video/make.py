@@ -89,7 +89,7 @@ class MadeAvatar:
 
 
 def default_folder(video: Path) -> Path:
-    """Return where the avatar of a video goes if nothing is said: `hand_avatar` for `hand.mp4`."""
+    """Return where the avatar of a video goes by default: `hand_avatar` for `hand.mp4`."""
     return video.with_name(f"{video.stem}_avatar")
 
 
@@ -105,7 +105,7 @@ def make_avatar(
 ) -> MadeAvatar:
     """Make an avatar of the hand in a video, with a clip and a sheet to look at.
 
-    The same call goes on after a stop: finished stages are kept, the fit continues from its saved
+    The same call continues after a stop: finished stages are kept, the fit continues from its saved
     state. Stages whose video, landmarks or settings have changed are run again, and those that
     build on them.
 
@@ -209,7 +209,7 @@ def fit(
 ) -> WildGHandAvatar:
     """Fit an avatar to a video or to a capture, as `wildghand fit` does.
 
-    A fit with a folder saves its state; when it was stopped, the same call goes on where it was.
+    A fit with a folder saves its state; when it was stopped, the same call continues where it was.
     Of a video every stage is kept that has ended.
 
     Args:

@@ -7,7 +7,7 @@ my_hand/avatar.html         a page that turns and poses the avatar
 my_hand/work                can be deleted once the avatar pleases; a second run then begins again
     landmarks.npz           the tracked hands
     capture/                the imported capture
-    avatar/, avatar.fit/    the finished fit; the state of one that goes on
+    avatar/, avatar.fit/    the finished fit; the state of one that continues
     verdict.json            how good the avatar is, and what to film next
     stages.json             what is done, with which video and settings
 
@@ -176,7 +176,7 @@ class Stage(ABC):
 
     @abstractmethod
     def run(self, job: VideoJob) -> None:
-        """Make the result; where the last run with the same facts was stopped, it may go on."""
+        """Make the result; where the last run with the same facts was stopped, it may continue."""
 
     @abstractmethod
     def expected(self, job: VideoJob) -> float:

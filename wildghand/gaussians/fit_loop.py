@@ -44,7 +44,7 @@ def fewest(seconds: Mapping[int, float]) -> int:
 
 
 class StepThreads:
-    """The choice for one fit among `numbers` of threads; one or none is not measured.
+    """The choice of a number of threads for one fit, among `numbers`.
 
     `shared` steps share work which one of them does; a block has all of them.
     """

@@ -96,7 +96,7 @@ class DrawnAvatar(HandAvatar):
     """An avatar that a function draws; see `HandAvatar`.
 
     Args:
-        draw: as `HandAvatar.draw`; while a fit goes on it may draw the live model.
+        draw: as `HandAvatar.draw`; while a fit runs it may draw the live model.
     """
 
     def __init__(

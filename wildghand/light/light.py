@@ -84,7 +84,7 @@ _SOFT = 0.1
 
 @dataclass(frozen=True, eq=False)
 class CastLight(Found):
-    """The light that casts shadows: E(n, v), about 1 in the mean of what was read."""
+    """The light that casts shadows: E(n, v), with a mean of about 1 over the samples."""
 
     prefix = "shadows_"
     longest: ClassVar = {"K": 4096}

@@ -1,4 +1,4 @@
-"""The identity map and the four heads, each of which starts from what it is told to say."""
+"""The identity map and the four heads, each of which starts at a given output."""
 
 from __future__ import annotations
 

@@ -269,7 +269,7 @@ class LayerRow:
 
     @property
     def parameters(self) -> int:
-        """Parameters of all of them."""
+        """Number of parameters of all these layers."""
         return self.each * self.times
 
     @property

@@ -116,7 +116,7 @@ def sample_poses(
 def best_start(
     avatar: WildGHandAvatar, tried: Sequence[Mapping[str, HandPose]] = ()
 ) -> dict[str, HandPose]:
-    """Hands in the studio, where the light is as frames have shown it.
+    """Hands in the studio, lit as in the frames.
 
     Of the poses of fingers that are tried, or else at rest, in each turn, it is the one with most
     skin to the camera that frames show well, less the skin that they do not. A clip says how a hand

@@ -3,8 +3,8 @@
 A fit of seconds ends while its rates are still high: what it learnt last are the last few frames.
 The mean over the last tenth of its steps forgets which those were, and costs no step (`Averaging`).
 
-A fit that goes on learns what is wrong in single frames: a pose that a tracker gave, a finger that
-lies 3 px off its place. It draws its training frames the better for it, and others worse. How soon
+A long fit learns what is wrong in single frames: a pose that a tracker gave, a finger that lies
+3 px off its place. It draws its training frames the better for it, and others worse. How soon
 that begins depends on how wrong the frames are, which nothing in them tells: validation frames
 choose, which no step sees (`KeptStates`).
 """

@@ -101,7 +101,7 @@ class IterativeFit(Generic[Result]):
         return seconds
 
     def seconds_now(self) -> float:
-        """More seconds that are kept back by now; asked before each step."""
+        """Seconds of the budget that are reserved so far; asked before each step."""
         return 0.0
 
     def agree(self, fraction: float) -> float:
@@ -112,7 +112,7 @@ class IterativeFit(Generic[Result]):
         """Called after a step that was sound."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that steps change, where the fit can be stopped and go on."""
+        """Everything that steps change, where the fit can be stopped and continue."""
         raise NotImplementedError
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

@@ -148,7 +148,7 @@ class PlainAvatar(HandAvatar):
     """A fitted model that can be drawn in any pose; see `hwp_bench.methods.contract.Avatar`.
 
     Args:
-        model: what to draw. While the fit goes on it may be the live one.
+        model: what to draw. While the fit runs it may be the live one.
         steps: optimizer steps behind it.
     """
 

@@ -181,7 +181,7 @@ class Recipe(IterativeFit[Avatar], Generic[Settings]):
         raise NotImplementedError
 
     def avatar(self, steps: int) -> Avatar:
-        """The avatar that draws test frames; while the fit goes on it may share live tensors."""
+        """The avatar that draws test frames; while the fit runs it may share live tensors."""
         raise NotImplementedError
 
     def rate(self, name: str, fraction: float) -> float:
@@ -397,7 +397,7 @@ class PlainRecipe(Recipe[PlainSettings]):
         self.model.gaussians.log_scales.clamp_(math.log(low), math.log(high))
 
     def avatar(self, steps: int) -> Avatar:
-        """The avatar that draws test frames; while the fit goes on it may share live tensors."""
+        """The avatar that draws test frames; while the fit runs it may share live tensors."""
         return PlainAvatar(self.model, steps)
 
 

@@ -1,4 +1,4 @@
-"""The poses that a fit believes in: the given ones, less what they probably err by."""
+"""The poses that a fit believes in: the given ones, less their probable errors."""
 
 from __future__ import annotations
 

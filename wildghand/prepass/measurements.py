@@ -182,7 +182,7 @@ def misplacement(mask: np.ndarray, silhouette: np.ndarray) -> float:
 def interior(area: np.ndarray, margin: int) -> np.ndarray:
     """(H, W) bool: the pixels of an area that lie more than `margin` px inside; 1 at least."""
     shape = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * margin + 1, 2 * margin + 1))
-    # The hand goes on beyond the border of the image.
+    # The hand continues beyond the border of the image.
     eroded = cv2.erode(area.astype(np.uint8), shape, borderType=cv2.BORDER_REPLICATE)
     return eroded.astype(bool)
 

@@ -50,7 +50,7 @@ def pretrain(
 ) -> Prior:
     """Fit one network to captures of several subjects, and write it as a prior.
 
-    The state is saved next to `out` every 20 seconds. The same call goes on with it after a stop;
+    The state is saved next to `out` every 20 seconds. The same call continues with it after a stop;
     the result is that of a run that was never stopped.
 
     Args:

@@ -379,7 +379,7 @@ def _list_tiles(projected: Projected, options: Options) -> Lists:
 
 
 def _check_room(entries: int) -> None:
-    """Refuses lists that cannot be held, before the system ends the process for them."""
+    """Refuse lists that do not fit in memory, before the system ends the process."""
     needed = entries * _BYTES_PER_ENTRY
     if 0 <= needed < _LITTLE or 0 <= needed < psutil.virtual_memory().available:
         return

@@ -141,7 +141,7 @@ class _Bending:
         return self.shape
 
     def _solve(self, reach: float, stiffness: float) -> bool:
-        """One round: the numbers that explain the gaps of the outlines best.
+        """Solve one round: the numbers that best explain the gaps of the outlines.
 
         Args:
             reach: gap at which a point counts a quarter, px.

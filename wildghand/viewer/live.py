@@ -140,7 +140,7 @@ class LivePage:
             places = np.stack([x, z, -y], axis=1)
             solid = trimesh.Trimesh(places, hand.faces, vertex_colors=hand.colors, process=False)
             self._meshes.append(self._server.scene.add_mesh_trimesh(f"hand{number}", solid))
-        self._text.content = "The hand, as far as the import has fitted it. The mouse turns it."
+        self._text.content = "The hand as the import has fitted it so far. The mouse turns it."
 
     def show(self, look: Glance) -> None:
         """Bring every page up to date."""

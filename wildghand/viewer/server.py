@@ -42,7 +42,7 @@ def refusal(headers: Mapping[str, str], loopback: bool) -> str | None:
 
 @contextlib.contextmanager
 def guarded(loopback: bool) -> Iterator[None]:
-    """Within this, servers of the package `websockets` that are started refuse other pages.
+    """A context in which new servers of the package `websockets` refuse other pages.
 
     Viser has no setting for it; it starts its server while its object is made.
     """
@@ -62,7 +62,7 @@ def guarded(loopback: bool) -> Iterator[None]:
 
 
 def _first_asked(then: Any, loopback: bool) -> Callable[[Any, Any], Any]:
-    """A `process_request` of websockets that refuses, or goes on with another one."""
+    """A `process_request` of websockets that refuses, or continues with another one."""
 
     async def process(connection: Any, request: Any) -> Any:
         reason = refusal(request.headers, loopback)
@@ -161,4 +161,4 @@ def _check(address: Address) -> None:
             problem = f"{address.port} may not be used by this user"
             raise UsageError(problem, field="--port", remedy="Use 1024 or more.") from error
         except OSError:
-            return  # taken: viser goes on to the next one
+            return  # taken: viser continues to the next one

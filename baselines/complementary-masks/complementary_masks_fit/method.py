@@ -18,7 +18,7 @@ PATCH = 5
 
 @dataclass(frozen=True)
 class ComplementaryMasksSettings(FitSettings):
-    """Those of the plain fit, and how the two masks and the two models act."""
+    """Settings of the plain fit, and how the two masks and the two models act."""
 
     #: Share of the moving average that stays at each step.
     teacher_decay: float = number(0.8, 0.0, 1.0)

@@ -37,7 +37,7 @@ SHAPE = ("offsets", "log_scales", "quats")
 
 @dataclass(frozen=True)
 class DelayedMaskSettings(FitSettings):
-    """Those of the plain fit, and how the mask is learnt and delayed."""
+    """Settings of the plain fit, and how the mask is learnt and delayed."""
 
     #: Share of the fit before the mask is learnt and pixels are left out.
     mask_from: float = number(1 / 60, 0.0, 1.0)

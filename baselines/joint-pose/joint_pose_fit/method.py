@@ -14,7 +14,7 @@ from wildghand.plain.recipe import Batch, Drawing, FitInputs, FitSettings, Plain
 
 @dataclass(frozen=True)
 class JointPoseSettings(FitSettings):
-    """Those of the plain fit, and how the corrections are fitted."""
+    """Settings of the plain fit, and how the corrections are fitted."""
 
     #: Adam step of the corrections of joint angles, rad.
     pose_rate: float = 3e-4

@@ -34,7 +34,7 @@ _LIT = 2.0
 
 @dataclass(frozen=True)
 class ScanSettings(LoopSettings):
-    """Those of the loop, and those of the two stages."""
+    """Settings of the loop, and those of the two stages."""
 
     #: Texels along an edge of the texture.
     texture_size: int = number(512, 16, 2048)

@@ -189,7 +189,7 @@ def to_srgb(linear: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class SpaceSettings(LoopSettings):
-    """Those of the loop, and those of texture, light and shape."""
+    """Settings of the loop, and those of texture, light and shape."""
 
     #: Adam step of the weights of the components, in standard deviations.
     latent_rate: float = 0.03

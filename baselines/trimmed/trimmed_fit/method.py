@@ -38,7 +38,7 @@ def chance_of_all(fraction: float, schedule_steps: float) -> float:
 
 @dataclass(frozen=True)
 class TrimmedSettings(FitSettings):
-    """Those of the plain fit, and how outliers are found."""
+    """Settings of the plain fit, and how outliers are found."""
 
     #: Who says which pixels are inliers: `rules` (threshold and neighbourhoods), or `vote` (a
     #: network of the image's features that learns from the rules).

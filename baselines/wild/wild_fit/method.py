@@ -178,7 +178,7 @@ class _ScaledGradient(torch.autograd.Function):
 
 @dataclass(frozen=True)
 class WildSettings(FitSettings):
-    """Those of the plain fit, and how appearance and uncertainty are fitted."""
+    """Settings of the plain fit, and how appearance and uncertainty are fitted."""
 
     #: Numbers that stand for a frame.
     frame_features: int = number(32, 1, 1024)

@@ -32,7 +32,7 @@ CONTROLLER = 0.01
 
 @dataclass(frozen=True)
 class ZeroMeanExposureSettings(FitSettings):
-    """Those of the plain fit, and how frames' numbers and the controller are fitted."""
+    """Settings of the plain fit, and how frames' numbers and the controller are fitted."""
 
     #: Adam step of the frames' numbers.
     frame_rate: float = 0.03
@@ -113,7 +113,7 @@ class ExposedAvatar(PlainAvatar):
     """The plain avatar with the exposure and the chromaticity that a controller predicts.
 
     Args:
-        controller: its tensors; while the fit goes on they may be the live ones.
+        controller: its tensors; while the fit runs they may be the live ones.
     """
 
     def __init__(

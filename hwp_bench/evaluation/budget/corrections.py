@@ -1,6 +1,6 @@
 """Corrections of a predicted frame that only its truth can tell: oracles at test time.
 
-Each takes away one kind of error as far as a few numbers can: light as a gain of linear light,
+Each takes away what a few numbers can of one kind of error: light as a gain of linear light,
 place as a motion of the image, pose as a motion of the posed surface. What a correction gains is
 what that kind of error costs. The parameters are found by Gauss-Newton steps on the squared error
 in sRGB, which PSNR counts.

@@ -76,7 +76,7 @@ class HuggingFaceHub:
         return str(info.sha), files
 
     def fetch(self, name: str, commit: str, folder: Path) -> Path:
-        """Download one file below a folder, going on where an earlier try stopped."""
+        """Download one file below a folder, continuing where an earlier try stopped."""
         return Path(
             self._hub.hf_hub_download(
                 REPOSITORY,
@@ -100,7 +100,7 @@ def download_release(
     """Download the release, or some captures of it.
 
     On first use the checksum of every file is pinned for its commit in the user's cache; a later
-    download of the same commit must bring the same bytes. An interrupted download goes on where
+    download of the same commit must bring the same bytes. An interrupted download continues where
     it stopped and stays at its commit. An existing file that differs is never replaced.
     """
     folder = Path(out)
@@ -192,5 +192,5 @@ def _ask(function: Callable[..., Any], *arguments: Any) -> Any:
         raise HwpError(
             f"cannot be downloaded ({reason})",
             where=REPOSITORY,
-            remedy="Run the same command again; it goes on where it stopped.",
+            remedy="Run the same command again; it continues where it stopped.",
         ) from error

@@ -160,7 +160,7 @@ def _matrix(frame: Any, stated: int, expected: int | None, path: Path) -> int:
         return 0
     if stated in _MATRICES:
         return stated
-    # Some recorders write 0, the mark of red, green and blue, for what is none.
+    # Some recorders write 0, the mark of red, green and blue, for any other value.
     if stated not in (0, _UNSPECIFIED, _RESERVED):
         raise _refused(path, _OTHER_MATRICES.get(stated, f"matrix {stated} of H.273"))
     if expected is not None:

@@ -465,7 +465,7 @@ def beyond_wrist(
 
     The open end of the mesh spans a plane; its normal points along the forearm. Seen at the
     wrist's depth, the plane cuts the image in a line, and the forearm lies behind the line. There
-    is none for a mesh without an open end, or seen straight along the forearm.
+    is no such line for a mesh without an open end, or seen straight along the forearm.
     """
     if len(ring) < 3:
         return np.zeros((size, size), dtype=bool)

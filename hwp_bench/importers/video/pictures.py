@@ -31,7 +31,7 @@ from hwp_bench.importers.video.model import (
     pose_vertices,
 )
 
-# Texels beyond a chart that go on as its border, so that interpolation reads nothing else.
+# Texels beyond a chart that continue as its border, so that interpolation reads nothing else.
 _MARGIN = 1.5
 # Px, deviation of a Gaussian that is still well taken from pixels.
 _FINE = 2.5
@@ -53,7 +53,7 @@ def sample(
 ) -> np.ndarray:
     """Read an image (H, W) or (H, W, C) float32 at (P, 2) px, pixel centres at +0.5; C at most 4.
 
-    `how` and `border` are OpenCV's; outside of the image it is zero if nothing else is said.
+    `how` and `border` are OpenCV's; outside of the image it is zero by default.
     """
     padded = np.zeros((-(-max(len(places), 1) // _ROW) * _ROW, 2), np.float32)
     padded[: len(places)] = places - 0.5

@@ -414,7 +414,7 @@ def match_outline(
 ) -> Outline:
     """Match the outline of a mesh, (V, 2) px of the field, with the outline of a mask.
 
-    Each of the `candidates` looks along its normal, as far as `reach` px, for the nearest place
+    Each of the `candidates` looks along its normal, up to `reach` px, for the nearest place
     where the mask ends in the same direction: a finger's left side never snaps to the right side
     of its neighbour, as it may with the plainly nearest point.
     """

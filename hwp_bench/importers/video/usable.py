@@ -2,7 +2,7 @@
 
 What tells is measured in frames: the size of the hand, whether it is cut off, how far it moves, its
 exposure, its colour, and whether something is drawn over it. A fault in a tenth of the frames
-that show the hand is said, one in most of them leaves nothing that an avatar could be made of.
+that show the hand is reported, one in most of them leaves nothing that an avatar could be made of.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from hwp_bench.importers.video.source import VideoImport, VideoSource
 
 #: Smallest hand, px of the video: the larger side of its landmarks' box in a typical frame.
 SMALLEST = 60.0
-# Share of the frames with a hand from which a fault is said, and from which it is too much.
+# Share of the frames with a hand from which a fault is reported, and from which it is too much.
 _SOME, _MOST = 0.1, 0.5
 # A hand is cut off if so many of its 20 landmarks without the wrist lie outside of the frame.
 _OUTSIDE = 3

@@ -236,7 +236,7 @@ class _Run:
                 )
 
     def _cancel(self) -> None:
-        """Stop what still runs, so that no method goes on when nobody takes its result."""
+        """Stop what still runs, so that no method continues when nobody takes its result."""
         pending = list(self._pending)
         for reference in pending:
             self._ray.cancel(reference)
@@ -302,7 +302,7 @@ def check_head(address: str) -> None:
 
 @contextlib.contextmanager
 def connected(address: str | None) -> Iterator[Any]:
-    """Join a cluster, or start one on this machine; left again at the end.
+    """Join a cluster, or start one on this machine, and leave it at the end.
 
     Ray's output is thrown away: standard output is for results.
     """

@@ -34,7 +34,7 @@ Place = tuple[str, str, str]
 _NAMESPACES = syscalls.CLONE_NEWUSER | syscalls.CLONE_NEWNS | syscalls.CLONE_NEWPID
 _NAMESPACES |= syscalls.CLONE_NEWNET | syscalls.CLONE_NEWIPC
 _QUIET = syscalls.MS_NOSUID | syscalls.MS_NODEV
-# Most seconds that are spent on ending descendants; a storm of forks could go on for ever.
+# Most seconds that are spent on ending descendants; a storm of forks could last for ever.
 _PATIENCE = 5.0
 
 

@@ -223,7 +223,7 @@ class _Watch:
 
 
 def _processes_of(root: int) -> list[int]:
-    """Return the running descendants of a process, as far as the system shows them."""
+    """Return the running descendants of a process, that the system shows."""
     import psutil
 
     with contextlib.suppress(psutil.Error):
@@ -347,7 +347,7 @@ def _kills(table: str | Path) -> int:
 def offer_to_kernel(processes: Iterable[int]) -> None:
     """Have the kernel end these processes first, and not others, when memory runs out.
 
-    They may take it back, so that it is said again whenever they are looked at.
+    They may take it back, so that it is set again at every look.
     """
     for process in processes:
         with contextlib.suppress(OSError), open(f"/proc/{process}/oom_score_adj", "r+") as stream:

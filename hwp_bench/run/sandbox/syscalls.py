@@ -215,7 +215,7 @@ def leave_session_keyring() -> None:
 
 
 class _Test(NamedTuple):
-    """A condition on one argument of a call, as far as its lower 32 bits."""
+    """A condition on one argument of a call, on its lower 32 bits."""
 
     argument: int
     #: `_EQUAL` or `_ANY_BIT`, and what the argument is compared with.

@@ -2,8 +2,8 @@
 
 The rig keeps its own mesh, skinning weights and texture. A left hand is made of a right one by
 mirroring, and the other way round. Meshes of any topology are taken: rigs are closed at the wrist,
-go on as a forearm or a whole body, or have holes elsewhere. The wrist is found from the joints: an
-outline is the wrist's if it runs around the arm and lies near the wrist's joint. Where there is
+continue as a forearm or a whole body, or have holes elsewhere. The wrist is found from the joints:
+an outline is the wrist's if it runs around the arm and lies near the wrist's joint. Where there is
 none, a plane across the arm cuts the mesh as far behind the joint as the free hand ends. All other
 holes are closed.
 

@@ -153,7 +153,7 @@ def area_light(lamp: Lamp) -> AreaLight:
     """The light of a lamp."""
     place = np.array(lamp.place)
     facing = -unit(place)
-    # Upright as far as it can be; a lamp straight above has its width from left to right.
+    # As upright as it can be; a lamp straight above has its width from left to right.
     upright = np.array([0.0, 1.0, 0.0]) if abs(facing[1]) < 0.99 else np.array([0.0, 0.0, 1.0])
     across = unit(np.cross(upright, facing))
     down = np.cross(facing, across)

@@ -1,7 +1,7 @@
 """From a scene to a capture folder, and from a suite to captures in the cache.
 
 Frames are rendered in parallel, the same on any machine. They wait in one file each until their
-capture is whole; a render that was interrupted goes on where it stopped.
+capture is whole; a render that was interrupted continues where it stopped.
 """
 
 from __future__ import annotations

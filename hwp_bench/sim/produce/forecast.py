@@ -56,7 +56,7 @@ class Forecast:
     free_rays: int | None = None
 
     def shares(self) -> dict[str, float] | None:
-        """Seconds by cause: `clean`, then the extra of each effect; they add up to all.
+        """Seconds by cause: `clean`, then the extra of each effect; they add up to the total.
 
         Where effects meet in a frame the extra cost is split by what each costs on its own.
         """

@@ -525,7 +525,7 @@ class Face:
         v = np.cos(tilt) * y - np.sin(tilt) * x
         columns = (u - _FRAME[0]) / (_FRAME[1] - _FRAME[0]) * (_COLUMNS - 1)
         rows = (v - _FRAME[2]) / (_FRAME[3] - _FRAME[2]) * (_ROWS - 1)
-        # Below the frame the shoulders go on.
+        # Below the frame the shoulders continue.
         rows = np.where(rows > _ROWS - 1, np.minimum(rows, _ROWS - 1.0), rows)
         at = (columns.astype(np.float32), rows.astype(np.float32))
         seen = cv2.remap(picture, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)

@@ -37,7 +37,7 @@ def test_what_is_no_name_is_refused(text: str) -> None:
 
 @pytest.mark.parametrize("value", ["{b=1", "[1, 2", '"word', "'word", "[bold]", ' {b="c}'])
 def test_what_begins_as_toml_is_toml(value: str) -> None:
-    with pytest.raises(UsageError, match="begins as TOML and is none") as error:
+    with pytest.raises(UsageError, match="looks like TOML and is not") as error:
         overrides([f"a={value}"])
     assert error.value.where == "--set"
 

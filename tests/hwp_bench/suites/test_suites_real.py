@@ -228,7 +228,7 @@ def test_what_the_network_does_not_give_is_left_out_by_name(
 ) -> None:
     first, second = list(server)
     there, server[second] = server.pop(first), server[second][:-1] + b"!"
-    with pytest.raises(HwpError, match="no clip of real-1 could be had"):
+    with pytest.raises(HwpError, match="no clip of real-1 is available"):
         ensure_suite("real-1")
     told = capsys.readouterr().err
     assert "real-1 without first" in told
