@@ -64,8 +64,8 @@ def bootstrap_mean(
       widened for the captures' small number, so that the resamples spread as the mean does;
     - the standard deviation of the resamples is read with Student's t, with one degree of
       freedom less than captures (than their effective number 1 / sum(w^2), if weighted);
-    - from four captures on, the end of the interval on the side of a long tail is moved out as
-      far as the captures' skewness asks for (`interval_reaches`).
+    - from four captures on, the end of the interval on the side of a long tail is moved out
+      by the captures' skewness (`interval_reaches`).
 
     Args:
         samples: one (S, F) float array a capture: the difference for each seed and frame.

@@ -11,7 +11,7 @@ squares between methods, MB with k - 1 degrees of freedom, and within them, MW w
 
 Sources: Shrout and Fleiss, Intraclass correlations: uses in assessing rater reliability,
 Psychological Bulletin 86(2), 1979, for ICC(1,1); Searle, Casella and McCulloch, Variance
-Components, 1992, for n0. A ratio of 1 means that another seed moves a method as far as another
+Components, 1992, for n0. A ratio of 1 means that another seed moves a method as much as another
 method does.
 """
 

@@ -11,8 +11,8 @@ my_hand/work                can be deleted once the avatar pleases; a second run
     verdict.json            how good the avatar is, and what to film next
     stages.json             what is done, with which video and settings
 
-The record of a job says which stages have ended, and with which facts, so that a stopped job goes
-on where it was.
+The record of a job says which stages have ended, and with which facts, so that a stopped job
+continues where it was.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Fitting one network to captures of several subjects, for a prior.
 
-Branches and heads are shared, everything else is the captures' own. A run can be stopped and goes
-on.
+Branches and heads are shared, everything else is the captures' own. A run can be stopped and
+continues.
 """
 
 from __future__ import annotations

@@ -464,8 +464,8 @@ def beyond_wrist(
     """Pixels (size, size) bool on the forearm's side of the wrist.
 
     The open end of the mesh spans a plane; its normal points along the forearm. Seen at the
-    wrist's depth, the plane cuts the image in a line, and the forearm lies behind the line. There
-    is no such line for a mesh without an open end, or seen straight along the forearm.
+    wrist's depth, the plane cuts the image in a line, and the forearm lies behind the line. A
+    mesh without an open end, or seen straight along the forearm, has no such line.
     """
     if len(ring) < 3:
         return np.zeros((size, size), dtype=bool)
