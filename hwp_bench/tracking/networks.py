@@ -563,7 +563,7 @@ class _Network:
 
 @contextlib.contextmanager
 def _silent() -> Iterator[None]:
-    """Keep the runtime's own remarks, which it writes past Python, from standard error."""
+    """Hide what the runtime itself writes to standard error."""
     kept = os.dup(2)
     nowhere = os.open(os.devnull, os.O_WRONLY)
     try:

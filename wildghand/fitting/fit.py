@@ -146,7 +146,7 @@ class Component:
         return {}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from a saved state."""
+        """Continue from a saved state."""
 
 
 Kind = TypeVar("Kind", bound=Component)
@@ -435,7 +435,7 @@ class Fit(IterativeFit[WildGHandAvatar]):
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from a saved state."""
+        """Continue from a saved state."""
         self.model.load_state_dict(state["model"])
         self.descent.load_state_dict(state["descent"])
         self.load_component_states(state["components"])

@@ -184,7 +184,7 @@ def run_in_world(choose: Callable[[], torch.device], work: Callable[[World], int
 
 
 def _speaks_first(world: World | None) -> bool:
-    """Whether this process says why all of them fail; None before they have met."""
+    """Whether this process reports the failure of all; None before they are connected."""
     if world is not None:
         return world.speaks_first()
     # They fail alike: the first of them speaks for all.

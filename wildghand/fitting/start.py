@@ -1,4 +1,4 @@
-"""The start of a fit: the poses it believes in, the person's hand, and the prior."""
+"""The start of a fit: corrected poses, the person's hand, and the prior."""
 
 from __future__ import annotations
 

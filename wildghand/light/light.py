@@ -329,8 +329,8 @@ class _Pursuit:
         Args:
             candidates: (K, 3).
             falling: (M, K) their irradiance.
-            lamps: that are there already; near them there is no other.
-            left: by what is there already.
+            lamps: those found so far; no other is sought near them.
+            left: the light that is not explained yet.
         """
         gains = self._gains(falling, left)
         if lamps:

@@ -261,7 +261,7 @@ def _check_names(changes: Mapping[str, Any], known: Mapping[str, Any]) -> None:
 
 
 def _without_idle_parts(settings: WildGHandSettings) -> WildGHandSettings:
-    """The same settings; what could not act is off."""
+    """Switch off what has no effect in these settings."""
     dpd, pao, prepass = settings.dpd, settings.pao, settings.prepass
     return dataclasses.replace(
         settings,

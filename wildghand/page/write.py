@@ -405,6 +405,6 @@ def _weights(avatar: WildGHandAvatar, frames: Sequence[int]) -> list[float]:
 def _of_frames(
     avatar: WildGHandAvatar, values: Sequence[float], frames: Sequence[int]
 ) -> list[float]:
-    """Of values of all fitted frames those of some."""
+    """Select the values of some of the fitted frames."""
     found = dict(zip(avatar.record.frames, values, strict=True))
     return [round(found[frame], 4) for frame in frames]

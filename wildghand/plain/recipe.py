@@ -201,7 +201,7 @@ class Recipe(IterativeFit[Avatar], Generic[Settings]):
         return soft_weights(batch.masks, self.settings.outside_weight)
 
     def loss(self, batch: Batch, drawing: Drawing, weights: torch.Tensor) -> torch.Tensor:
-        """The scalar that Adam makes small."""
+        """The scalar that Adam minimizes."""
         return photometric_loss(drawing.image, batch.images, weights, self.settings.dssim_weight)
 
     def outline(self, batch: Batch, drawing: Drawing, weights: torch.Tensor) -> torch.Tensor:

@@ -160,7 +160,7 @@ def _shared(residual: np.ndarray, pixels: np.ndarray, size: tuple[int, ...]) -> 
 
 
 def _amid(known: np.ndarray, pixels: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
-    """(P,) bool: the pixel's place is known, and so are those around it."""
+    """(P,) bool: whether the pixel's place and its neighbours are known."""
     unknown = np.zeros(size, dtype=np.uint8)
     unknown.reshape(-1)[pixels] = ~known
     near = cv2.dilate(unknown, np.ones((_WINDOW, _WINDOW), dtype=np.uint8))

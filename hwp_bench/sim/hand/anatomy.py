@@ -96,7 +96,7 @@ class Anatomy:
         return np.clip(lines, 0.0, 1.5), np.clip(swell, 0.0, 1.0)
 
     def _around(self, middle: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-        """Indices of the places around one, and there 1 in its middle, which fades at a radius."""
+        """Indices of the places within a radius, and weights that fall from 1 at the centre."""
         power = (np.linalg.norm(self.points - middle, axis=1) / radius) ** 4
         rows = np.flatnonzero(power < _LOST)
         return rows, np.exp(-power[rows])

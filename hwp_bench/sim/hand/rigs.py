@@ -530,7 +530,7 @@ def load_rig(path: str, side: str, model: HandTemplate) -> tuple[HandTemplate, n
 
 
 def _side_by_curl(places: np.ndarray) -> str:
-    """The side of a hand by where its fingers curl."""
+    """Tell the side of a hand from the direction in which its fingers curl."""
     back_if_right = np.cross(places[4] - places[0], places[1] - places[7])
     curl = sum(places[i + 2] - places[i] for i in (1, 4, 7, 10, 13))
     return "right" if curl @ back_if_right < 0 else "left"

@@ -273,7 +273,7 @@ def render_waiting_free(
 
 
 def read_waiting(path: Path) -> dict[str, np.ndarray] | None:
-    """Read a rendered frame that waits, of capture or clip; None if it is missing or damaged."""
+    """Read a finished frame of capture or clip; None if it is missing or damaged."""
     try:
         return read_npz(path)
     except BadInput:

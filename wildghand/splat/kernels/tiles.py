@@ -273,7 +273,7 @@ def _fixed(channels: Any) -> bool:
 
 
 def count(channels):
-    """How many channels: a constant where they are fixed."""
+    """The number of channels, a constant where it is fixed."""
 
 
 @overload(count)
