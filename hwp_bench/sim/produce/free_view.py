@@ -137,8 +137,8 @@ def camera_directions(scene: Scene, count: int = FRAMES) -> np.ndarray:
 def hand_axes(hands: Mapping[str, HandMoment]) -> np.ndarray:
     """Axes of `camera_directions` in the world, as columns: (3, 3).
 
-    z points along the fingers, of both hands on the average, y is the back of the first hand as
-    far as it is perpendicular to them.
+    z points along the fingers, of both hands on the average, y along the back of the first
+    hand, perpendicular to them.
     """
     turns = [(side, heading_matrix(moment.heading, side)) for side, moment in hands.items()]
     # At rest the fingers of the right hand point along -x, those of the left along +x.
