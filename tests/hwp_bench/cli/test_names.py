@@ -24,7 +24,7 @@ ODD = os.fsdecode(b"a\xff\xfe")
     "words",
     [
         ["data", "check", ODD],
-        ["data", "audit", ODD],
+        ["data", "check", ODD],
         ["evaluate", "plain", "--capture", "x", "-o", ODD],
         ["evaluate", "plain", "--capture", "x", "--set", f"level={ODD}"],
         [ODD],
