@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import shlex
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -28,7 +28,7 @@ from hwp_bench.cli.options import (
 from hwp_bench.taxonomy import REAL_SUITES, SUITES
 
 if TYPE_CHECKING:
-    from hwp_bench.capture.check import CheckReport
+    from hwp_bench.capture.check import CheckReport, Finding
     from hwp_bench.capture.splits import AuditReport, Split
 
 _CHECK = """examples:
@@ -67,7 +67,7 @@ def _check(args: argparse.Namespace) -> int:
             split = None if audit is None else {"ok": audit.ok, **asdict(audit)}
             rows.append({"ok": report.ok, **asdict(report), "split": split})
             continue
-        print_check(report)
+        _print_check(report)
         if audit is not None:
             _print_audit(audit)
     if args.json:
@@ -75,15 +75,19 @@ def _check(args: argparse.Namespace) -> int:
     return 0 if sound else 1
 
 
-def print_check(report: CheckReport) -> None:
-    """Print facts and findings of a check."""
+def _print_check(report: CheckReport) -> None:
     title = f"{shown(report.path)}: {'sound' if report.ok else 'NOT SOUND'}"
     if report.facts:
         rows = [(name, _fact(value)) for name, value in report.facts.items()]
         print_table(named_table(title, "fact, value", rows))
     else:
         print(title)
-    for finding in report.findings:
+    print_findings(report.findings)
+
+
+def print_findings(findings: Iterable[Finding]) -> None:
+    """Print what is wrong, a line each."""
+    for finding in findings:
         parts = (finding.level, finding.where, finding.field, finding.problem)
         remedy = f" {finding.remedy}" if finding.remedy else ""
         said = ": ".join(part for part in parts if part)

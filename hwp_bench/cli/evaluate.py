@@ -54,13 +54,13 @@ replaced once all new ones are there.
 Exit status 0: every frame was scored; 1: the method failed on a capture or left out frames
 (they get the protocol's penalty); 2: the command line is wrong.
 """
-_METHOD_HELP = "method directory, or the name of a shipped method"
+METHOD_HELP = "method directory, or the name of a shipped method"
 
 
 def _add_evaluate(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EVALUATE
     add = parser.add_argument
-    add("methods", nargs="+", metavar="METHOD_DIR", help=_METHOD_HELP)
+    add("methods", nargs="+", metavar="METHOD_DIR", help=METHOD_HELP)
     _add_evaluation(parser)
     sealed = "sealed part of a publication, instead of captures; checked against its commitment"
     add("--sealed", metavar="DIR", help=sealed)
@@ -426,7 +426,7 @@ Exit status 1: the method failed on a capture or left out frames.
 def _add_error_budget(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _ERROR_BUDGET
     add = parser.add_argument
-    add("method", metavar="METHOD_DIR", help=_METHOD_HELP)
+    add("method", metavar="METHOD_DIR", help=METHOD_HELP)
     text = "estimates that the truth replaces (default: all that the captures know)"
     add("--truths", nargs="*", metavar="NAME", help=text)
     _add_evaluation(parser)

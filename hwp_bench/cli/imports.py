@@ -290,12 +290,12 @@ def _add_rendered(parser: argparse.ArgumentParser) -> None:
 def _rendered(args: argparse.Namespace) -> int:
     from hwp_bench.capture import open_capture
     from hwp_bench.capture.splits import split_for
-    from hwp_bench.commitments.inputs import check_name
     from hwp_bench.importers.official.rendered import import_rendered
+    from hwp_bench.methods.template import check_name
 
     inputs = {"DIR": args.folder, "--capture": args.capture, "--splits": args.splits}
     check_places({"--out": args.out}, inputs)
-    check_name(args.name)
+    check_name(args.name, "--name")
     capture = open_capture(args.capture)
     split = split_for(capture.info.id, capture.info.frame_count, splits_of(args))
     more = {"name": args.name, "overwrite": args.overwrite}

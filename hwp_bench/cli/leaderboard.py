@@ -67,7 +67,7 @@ names.json, next to the folder of entries. `leaderboard add` lists what it adds.
 _CONFIRM = """examples:
   hwp-bench leaderboard confirm runs/mine-mini --checked-by maintainers
   hwp-bench leaderboard confirm runs/second-run --checked-by maintainers --tolerance 0.05
-  hwp-bench leaderboard confirm runs/second --checked-by maintainers --entry mine-mini-seed0-0123abcd
+  hwp-bench leaderboard confirm runs/second --checked-by maintainers --entry mine-mini-0123abcd
 
 Checks are never removed. Where checks of an entry contradict each other, the one that differs
 counts until a new check overrules it by name (--overrules, --reason).

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hwp_bench.base.console import notice
 from hwp_bench.base.errors import UsageError, has_odd_characters, shown
 from hwp_bench.base.records import parse_toml
 from hwp_bench.base.tables import Cell, Column, Table
@@ -40,6 +41,12 @@ def print_result(as_json: bool, value: Any, lines: Iterable[str]) -> int:
     else:
         print("\n".join(lines))
     return 0
+
+
+def say_next(*commands: str) -> None:
+    """Say on standard error what a person does next, one command a line."""
+    for head, command in zip(("next:", *["     "] * len(commands)), commands, strict=False):
+        notice(f"{head} {command}")
 
 
 def named_table(caption: str, titles: str, rows: Iterable[Sequence[Cell]]) -> Table:
