@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import check_places
-from hwp_bench.cli.options import add_json, add_out, add_splits, print_json, print_result, splits_of
+from hwp_bench.cli.options import (
+    add_json,
+    add_out,
+    add_splits,
+    print_json,
+    print_result,
+    say_next,
+    splits_of,
+)
 from hwp_bench.run.engine.options import add_engine_arguments, engine_for, needs_of
 from hwp_bench.taxonomy import SIMULATED_SUITES
 
@@ -87,6 +95,7 @@ def _make(args: argparse.Namespace) -> int:
         "commitment to the frames": made.page.frames_commitment,
     }
     value = {name.replace(" ", "_"): text for name, text in facts.items()}
+    say_next("hwp-bench", "evaluate", "SUBMISSION", "--sealed", made.sealed)
     return print_result(args.json, value, [f"{name}: {text}" for name, text in facts.items()])
 
 

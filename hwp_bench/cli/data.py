@@ -23,6 +23,7 @@ from hwp_bench.cli.options import (
     named_table,
     print_json,
     print_result,
+    say_next,
     splits_of,
 )
 from hwp_bench.taxonomy import REAL_SUITES, SUITES
@@ -72,6 +73,8 @@ def _check(args: argparse.Namespace) -> int:
             _print_audit(audit)
     if args.json:
         print_json(rows)
+    if sound:
+        say_next("hwp-bench", "evaluate", "plain", "--capture", *args.captures)
     return 0 if sound else 1
 
 
@@ -232,6 +235,7 @@ def _get(args: argparse.Namespace) -> int:
         f"folder: {folder}, {len(files)} files, {made.kept} of them existed before",
         f"commit: {made.commit}",
     )
+    say_next("hwp-bench", "data", "import", "wildghand", folder, "-o", "captures")
     return print_result(args.json, value, lines)
 
 
@@ -243,6 +247,7 @@ def _get_clips(args: argparse.Namespace) -> int:
     lines += [f"missing: {clip}" for clip in missing]
     value = {"captures": [str(folder) for folder in folders], "missing": dict(missing)}
     print_result(args.json, value, lines)
+    say_next("hwp-bench", "evaluate", "plain", "--suite", args.name)
     return int(bool(missing))
 
 
@@ -311,6 +316,8 @@ def _track(args: argparse.Namespace) -> int:
         f"score {hand['mean_score']:.3f}; votes: right {hand['right']:.2f}, left {hand['left']:.2f}"
         for hand in facts["hands"]
     ]
+    words = ("hwp-bench", "data", "import", "video", args.video, "--landmarks", out, "-o")
+    say_next(*words, args.video.with_suffix(""))
     return print_result(args.json, {"landmarks": str(out), **facts}, lines)
 
 

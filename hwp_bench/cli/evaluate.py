@@ -20,6 +20,7 @@ from hwp_bench.cli.options import (
     add_suite_or_captures,
     overrides,
     print_json,
+    say_next,
     splits_of,
 )
 from hwp_bench.run.engine.options import add_engine_arguments
@@ -132,7 +133,12 @@ def _evaluate(args: argparse.Namespace) -> int:
             # Captures of a person's own may have no perturbation to speak of.
             if len(tables[name].columns) > 1:
                 print_table(tables[name])
-    return _report_outcome(out, results)
+    status = _report_outcome(out, results)
+    if status:
+        say_next("hwp-bench", "check-method", method)
+    else:
+        say_next("hwp-bench", "report", out, "-o", Path("reports") / out.name)
+    return status
 
 
 class Call(NamedTuple):
@@ -187,6 +193,9 @@ def _evaluate_several(
     elif table is not None:
         print_table(table)
     notice(f"results: {out}; more tables: hwp-bench table {out} --by NAME")
+    if len(manifests) > 1:
+        say_next("hwp-bench", "compare", out)
+    say_next("hwp-bench", "report", out, "-o", Path("reports") / out.name)
     return status
 
 
@@ -389,6 +398,7 @@ def _report_ablate(ablation: AblationRuns, out: Path, *, as_json: bool) -> int:
                 print_table(tables[name])
     _draw_ablate(ablation, out)
     notice(f"record: {write_record(out, record)}; tables: {out / 'tables'}")
+    say_next("hwp-bench", "report", out, "-o", Path("reports") / out.name)
     status = 0
     for name, runs in ablation.runs.items():
         for seed, result in runs.seeds.items():
@@ -546,6 +556,7 @@ def _demo(args: argparse.Namespace) -> int:
     picture = out / "side-by-side.png"
     write_side_by_side(picture, sources, [open_capture(capture) for capture in captures])
     notice(f"truth and methods side by side: {picture}; tables: {out / 'tables'}")
+    say_next("hwp-bench", "new", "my_method")
     return status
 
 

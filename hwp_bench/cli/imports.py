@@ -16,6 +16,7 @@ from hwp_bench.cli.options import (
     add_splits,
     print_json,
     print_result,
+    say_next,
     splits_of,
 )
 
@@ -101,6 +102,8 @@ def _video(args: argparse.Namespace) -> int:
         print_json(clip.facts())
     else:
         _print_video(clip, args)
+    say_next("hwp-bench", "data", "check", args.out)
+    say_next("wildghand", "fit", args.out, "-o", f"{args.out}_avatar")
     return 0
 
 
@@ -203,6 +206,7 @@ def _wildghand(args: argparse.Namespace) -> int:
         for warning in facts["warnings"]:
             notice(f"warning: {folder.path}: {warning}")
         results.append({"out": str(out), **facts})
+    say_next("hwp-bench", "data", "check", *(facts["out"] for facts in results))
     return print_result(args.json, results, [line for r in results for line in _official_lines(r)])
 
 
@@ -257,6 +261,7 @@ def _interhand26m(args: argparse.Namespace) -> int:
         seen = f"in {error['frames_valid']} frames"
         lines.append(f"{side} hand: {seen}, joints {joints} from the annotated")
     lines.append(f"look at: {args.out}/extra/overlay.png")
+    say_next("hwp-bench", "data", "check", args.out)
     return print_result(args.json, {"out": str(args.out), **facts}, lines)
 
 

@@ -62,13 +62,11 @@ def _new(args: argparse.Namespace) -> int:
     files = [str(file) for file in write_method(args.folder, args.kind)]
     print_result(args.json, files, files)
     if args.kind == "predictions":
-        say_next(
-            "hwp-bench data inputs --suite smoke -o inputs",
-            f"python {args.folder / 'draw.py'} inputs/requests",
-            f"hwp-bench check-method {args.folder} --suite smoke",
-        )
+        say_next("hwp-bench", "data", "inputs", "--suite", "smoke", "-o", "inputs")
+        say_next("python", args.folder / "draw.py", "inputs/requests")
+        say_next("hwp-bench", "check-method", args.folder, "--suite", "smoke")
     else:
-        say_next(f"hwp-bench check-method {args.folder}")
+        say_next("hwp-bench", "check-method", args.folder)
     return 0
 
 
@@ -140,9 +138,7 @@ def _check(args: argparse.Namespace) -> int:
         print(f"{report.path}: {f'{errors} things wrong' if errors else 'nothing wrong'}")
         print_findings(report.findings)
     if report.ok:
-        say_next(f"hwp-bench evaluate {args.method} --suite {args.suite or 'smoke'}")
-    else:
-        say_next(f"correct what is wrong, then hwp-bench check-method {args.method}")
+        say_next("hwp-bench", "evaluate", args.method, "--suite", args.suite or "smoke")
     return 0 if report.ok else 1
 
 

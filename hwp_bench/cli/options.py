@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -43,10 +44,9 @@ def print_result(as_json: bool, value: Any, lines: Iterable[str]) -> int:
     return 0
 
 
-def say_next(*commands: str) -> None:
-    """Say on standard error what a person does next, one command a line."""
-    for head, command in zip(("next:", *["     "] * len(commands)), commands, strict=False):
-        notice(f"{head} {command}")
+def say_next(*words: object) -> None:
+    """Say on standard error which command a person gives next."""
+    notice(f"next: {shlex.join(map(str, words))}")
 
 
 def named_table(caption: str, titles: str, rows: Iterable[Sequence[Cell]]) -> Table:

@@ -20,6 +20,7 @@ from hwp_bench.cli.options import (
     captures_of,
     named_table,
     print_json,
+    say_next,
     splits_of,
 )
 
@@ -323,7 +324,10 @@ def _verify(args: argparse.Namespace) -> int:
         print_json([asdict(outcome) for outcome in outcomes])
     for outcome in () if args.json else outcomes:
         _print_verify(outcome)
-    return 1 if any(outcome.discrepancies for outcome in outcomes) else 0
+    status = 1 if any(outcome.discrepancies for outcome in outcomes) else 0
+    if status == 0:
+        say_next("hwp-bench", "leaderboard", "submit", *args.results, "-o", "submission")
+    return status
 
 
 def _print_verify(outcome: Verification) -> None:

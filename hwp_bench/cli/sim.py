@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import check_places
-from hwp_bench.cli.options import add_json, add_overwrite, print_json
+from hwp_bench.cli.options import add_json, add_overwrite, print_json, say_next
 from hwp_bench.run.engine.options import add_engine_arguments
 from hwp_bench.taxonomy import SIMULATED_SUITES
 
@@ -197,6 +197,7 @@ def _render(args: argparse.Namespace) -> int:
         engine.run(jobs, lambda index: None)
     for job in jobs:
         print(job.output)
+    say_next("hwp-bench", "evaluate", "plain", "--capture", *(job.output for job in jobs))
     return 0
 
 

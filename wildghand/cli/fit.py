@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hwp_bench.cli.options import overrides, print_json
+from hwp_bench.cli.options import overrides, print_json, say_next
 from wildghand.cli.options import (
     add_address,
     add_ending,
@@ -131,6 +131,7 @@ def _video(args: argparse.Namespace, world: World) -> int:
         )
     if world.is_main:
         print_json(made.facts()) if args.json else _print(made)
+        say_next("wildghand", "view", made.facts()["avatar"])
     return 0
 
 
@@ -189,6 +190,8 @@ def _capture(args: argparse.Namespace, world: World) -> int:
             f"{args.out}: {hands} hand, {len(record.frames)} frames, {record.steps} steps "
             f"in {record.seconds:.0f} s"
         )
+    say_next("wildghand", "view", args.out, "--poses", args.source)
+    say_next("wildghand", "page", args.out, "--poses", args.source)
     return 0
 
 
