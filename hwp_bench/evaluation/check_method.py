@@ -17,6 +17,7 @@ from hwp_bench.base.errors import HwpError, MethodFailed, bounded
 from hwp_bench.base.folders import scratch_folder
 from hwp_bench.capture import Capture
 from hwp_bench.capture.check import CheckReport, Finding
+from hwp_bench.capture.schema import frame_name
 from hwp_bench.capture.splits import Split
 from hwp_bench.evaluation.capture_evaluation import EvaluationSettings
 from hwp_bench.evaluation.evaluate import make_plan, with_setting_files
@@ -87,6 +88,7 @@ def check_method(
             asked = plan.settings.confinement
             exposed = (*asked.exposed, *hand_model_files(capture.info.hand_model.source))
             confinement = replace(asked, exposed=exposed, hidden=(*asked.hidden, capture.root))
+            record = None
             try:
                 record = run_method(
                     manifest,
@@ -99,11 +101,12 @@ def check_method(
                 )
             except HwpError as error:
                 findings.append(_failure(error, name, output))
-            else:
+            heard = list(_heard(output, name))
+            findings += heard
+            if record is not None:
                 facts[name] = _facts(record, capture, split)
                 findings += _slow(record, name, len(split.test), settings.run.budget)
-                findings += _pictures(record, capture, split)
-            findings += _heard(output, name)
+                findings += _pictures(record, capture, split, colours=not heard)
     findings.sort(key=lambda finding: finding.level)
     return CheckReport(os.fspath(root), facts, tuple(findings))
 
@@ -155,32 +158,34 @@ def _slow(record: RunRecord, name: str, frames: int, budget: Budget) -> Iterator
         yield Finding("warning", name, "memory", problem, "Other machines may have less.")
 
 
-def _pictures(record: RunRecord, capture: Capture, split: Split) -> Iterator[Finding]:
-    """What is wrong with the pictures that were written."""
+def _pictures(
+    record: RunRecord, capture: Capture, split: Split, *, colours: bool
+) -> Iterator[Finding]:
+    """What is wrong with the pictures that were written, and with their `colours`."""
     name, clip = capture.info.id, capture.free_view
     targets = read_targets(capture, split.test.tolist())
-    yield from _frames(name, targets, record.predictions, capture.size)
+    yield from _frames(name, targets, record.predictions, capture.size, colours)
     if clip is not None and record.free_view is not None:
         views = read_targets(clip, range(len(clip)))
-        yield from _frames(f"{name}, free view", views, record.free_view, clip.size)
+        yield from _frames(f"{name}, free view", views, record.free_view, clip.size, colours)
 
 
 def _frames(
-    name: str, targets: Sequence[Target], folder: Path, size: tuple[int, int]
+    name: str, targets: Sequence[Target], folder: Path, size: tuple[int, int], colours: bool
 ) -> Iterator[Finding]:
     predictions = read_predictions(folder, [target.frame for target in targets], size)
     bad: dict[tuple[str, str], list[int]] = {}
     for one in predictions:
         if one.failure is not None:
             reason = one.failure.partition(": ")[2]
-            check = "image" if (folder / one.failure.partition(": ")[0]).exists() else "missing"
-            check = "shape" if " px" in reason and check == "image" else check
+            check = "image" if (folder / frame_name(one.frame)).exists() else "missing"
+            check = "shape" if "is expected" in reason and "pixels" in reason else check
             bad.setdefault((check, reason), []).append(one.frame)
     for (check, reason), frames in bad.items():
         where, count = f"{name}: frames {bounded(frames)}", f"{len(frames)} of {len(targets)}"
         problem = f"{count} pictures: {reason}"
         yield Finding("error", where, check, problem, _REMEDIES.get(check))
-    for text in colour_warnings(targets, predictions):
+    for text in colour_warnings(targets, predictions) if colours else ():
         yield Finding("error", name, "range", text, _REMEDIES["range"])
 
 

@@ -31,7 +31,9 @@ def draw(request, predictions, free):
     record = json.loads((request / "request.json").read_text())
     colour = mean_colour(request, record).round().astype(np.uint8)
     picture = np.broadcast_to(colour, (record["height"], record["width"], 3))
-    wanted = {predictions: range(*record["split"]["test"]), free: range(record["free_view"])}
+    # Captures without a free-view clip do not have the number of its frames.
+    views = range(record.get("free_view", 0))
+    wanted = {predictions: range(*record["split"]["test"]), free: views}
     for folder, frames in wanted.items():
         folder.mkdir(parents=True, exist_ok=True)
         for frame in frames:
