@@ -107,7 +107,7 @@ def make_targets(work: Path, seeds: int = 2) -> list[Target]:
     (method / "method.toml").write_text(_MANIFEST)
     capture = work / "capture0"
     bench = ["-m", "hwp_bench.cli.main"]
-    render = [*bench, "sim", "render", "capture0", "--frames", "10", "--size", "48"]
+    render = [*bench, "sim", "render", "capture0", "--frame-count", "10", "--size", "48"]
     render += ["--workers", "1"]
     # Scores of a free-view clip would only take time.
     status, said = _finish([*render, "--no-free-view", "-o", str(capture)])

@@ -54,7 +54,7 @@ def make_seeds(folder: Path) -> None:
     bench, hand = "hwp_bench.cli.main", "wildghand.cli.main"
     capture = str(folder / "capture")
     # The smallest clip that can be divided into training, validation and test frames.
-    _make(bench, "sim", "render", str(folder / "scene.toml"), "-o", capture, "--frames", "10",
+    _make(bench, "sim", "render", str(folder / "scene.toml"), "-o", capture, "--frame-count", "10",
           "--size", "32", "--workers", "1", "--no-free-view")  # fmt: skip
     method = folder / "gray"
     method.mkdir()
@@ -65,9 +65,9 @@ def make_seeds(folder: Path) -> None:
     _make(bench, "data", "inputs", *scored, "-o", str(folder / "inputs"))
     _write_submission(folder)
     _copy_entry(folder / "entries")
-    sealed = ("--frames", "10", "--size", "32", "--workers", "1", "-o", str(folder / "sealed"))
-    _make(bench, "sealed", "make", "capture0", *sealed)
-    _make(bench, "sealed", "reveal", str(folder / "sealed"), "-o", str(folder / "revealed.json"))
+    sealed = ("--frame-count", "10", "--size", "32", "--workers", "1", "-o", str(folder / "sealed"))
+    _make(bench, "challenge", "make", "capture0", *sealed)
+    _make(bench, "challenge", "reveal", str(folder / "sealed"), "-o", str(folder / "revealed.json"))
     shutil.copy(ROOT / "splits" / "hwp-v1.json", folder / "splits.json")
     _write_split(folder / "split.json", capture)
     _make(hand, "fit", capture, "-o", str(folder / "avatar"), *FIT)

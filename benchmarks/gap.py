@@ -2,8 +2,8 @@
 
 Run from the repository: `python -m benchmarks.gap --base RESULTS... --method RESULTS... --selection
 RESULTS... --clean RESULTS...`, results folders whose seeds are averaged. Base and method were given
-the perturbed frames, the oracles (fits of the base) only the unperturbed frames (`--frames
-unperturbed-only`) and the clean versions of all frames (`--frames clean`).
+the perturbed frames, the oracles (fits of the base) only the unperturbed frames (`--train-on
+unperturbed-only`) and the clean versions of all frames (`--train-on clean`).
 
 Share of a gap: (method - base) / (oracle - base). The last rows are of mean scores, so that a
 capture whose gap is nearly nothing does not decide; a share is empty where the oracle is no better

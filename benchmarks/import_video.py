@@ -1,4 +1,4 @@
-"""Seconds of `hwp-bench data import-video`, next to OpenCV's GrabCut of the same frames.
+"""Seconds of `hwp-bench data import video`, next to OpenCV's GrabCut of the same frames.
 
 Run from the repository: `python -m benchmarks.import_video [VIDEO --landmarks NPZ]`. Without a
 video the frames of a simulated capture become one, and the landmarks are those of its true hand.

@@ -116,7 +116,7 @@ def peak_memory(scene: str, frames: int, size: int, workers: int) -> float:
     """Largest memory of `hwp-bench sim render` and its processes, GB."""
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "hwp_bench.cli.main", "sim", "render", scene]
-        command += ["-o", str(Path(folder) / scene), "--frames", str(frames)]
+        command += ["-o", str(Path(folder) / scene), "--frame-count", str(frames)]
         command += ["--size", str(size), "--workers", str(workers)]
         with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
             peak, root = 0, psutil.Process(process.pid)

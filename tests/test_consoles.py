@@ -46,8 +46,8 @@ COMMANDS = (
     "data check CAPTURE",
     "data audit CAPTURE",
     "evaluate ENTRY --capture CAPTURE -o RUN",
-    "verify RUN --captures CAPTURE",
-    "sim list",
+    "verify RUN --capture CAPTURE",
+    "list scenes",
     "sim plan capture4 --no-probe",
     "wildghand info --network compact",
 )
@@ -289,7 +289,7 @@ def test_file_names_and_files_are_utf_8_in_every_locale(
     make_capture(frames=12).root.rename(tmp_path / "größe")
     script = (
         "$B table --published --format md > table.md && $B table --published"
-        " && $B data show größe --count 1 -o 手/ü.png"
+        " && $B data show größe --frame-count 1 -o 手/ü.png"
     )
     done = shell(script, tmp_path, **environment)
     assert done.returncode == 0, done.stderr.decode()

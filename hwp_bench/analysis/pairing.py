@@ -124,7 +124,7 @@ def refuse_unlike(runs: Sequence[MethodRuns]) -> None:
                 f"{between} were given different training frames "
                 f"({reference.frames} and {other.frames})",
                 field="frames",
-                remedy="Compare runs with the same --frames.",
+                remedy="Compare runs with the same --train-on.",
             )
         _same_captures(between, reference, other)
 

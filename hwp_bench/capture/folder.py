@@ -65,7 +65,7 @@ if TYPE_CHECKING:
 
 # Facts that a free-view clip shares with its capture.
 _SHARED = ("hands", "width", "height")
-_CONVERT = "Use the model that it was made with, or convert it: hwp-bench hands convert."
+_CONVERT = "Use the model that it was made with, or convert it: hwp-bench data convert."
 
 
 @dataclass(repr=False, eq=False)

@@ -1,9 +1,10 @@
-"""Commands about captures and hands: `data ...` without imports, and `hands ...`."""
+"""Commands about captures: `data ...` but for imports, and `dev card`."""
 
 from __future__ import annotations
 
 import argparse
 import shlex
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,45 +15,67 @@ from hwp_bench.base.files import check_places
 from hwp_bench.base.tables import print_table
 from hwp_bench.cli.options import (
     SEVERAL,
-    add_force,
     add_json,
     add_out,
+    add_overwrite,
     add_splits,
     add_suite_or_captures,
     named_table,
     print_json,
     print_result,
+    say_next,
     splits_of,
 )
 from hwp_bench.taxonomy import REAL_SUITES, SUITES
 
 if TYPE_CHECKING:
-    from hwp_bench.capture.check import CheckReport
-    from hwp_bench.capture.splits import AuditReport
+    from hwp_bench.capture.check import CheckReport, Finding
+    from hwp_bench.capture.splits import AuditReport, Split
 
 _CHECK = """examples:
   hwp-bench data check my_capture
   hwp-bench data check --json captures/*
+  hwp-bench data check captures/* --splits splits/hwp-v1.json
+  hwp-bench data check my_capture --guard 15
 
-Exit status 0: every capture is sound; 1: at least one is not.
+Checks the files of a capture, and that its split is fair: parts that are disjoint, and no test
+frame that is known to be perturbed. Exit status 0: so it is with every capture; 1: with at least
+one it is not. Near-copies across a border of the split do not change the status.
 """
 
 
 def _add_check(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _CHECK
     parser.add_argument("captures", nargs="+", metavar="CAPTURE", help="capture folder")
-    add_json(parser, "print the report as JSON")
+    add_splits(parser)
+    guard = "frames left out before each border of the split (default 0)"
+    parser.add_argument("--guard", type=int, default=0, help=guard)
+    add_json(parser, "print the reports as JSON")
 
 
 def _check(args: argparse.Namespace) -> int:
     from hwp_bench.capture.check import check_capture
 
-    reports = [check_capture(path) for path in track(args.captures, "checking captures")]
-    if args.json:
-        print_json([{"ok": report.ok, **asdict(report)} for report in reports])
-    for report in () if args.json else reports:
+    if args.guard < 0 or (args.guard and args.splits):
+        raise UsageError("a guard gap is at least 0, and not for a split file", field="--guard")
+    splits, rows, sound = splits_of(args), [], True
+    for path in track(args.captures, "checking captures"):
+        report = check_capture(path)
+        # Frames that cannot be read cannot be compared.
+        audit = _audit(path, splits, args.guard) if report.ok else None
+        sound = sound and report.ok and (audit is None or audit.ok)
+        if args.json:
+            split = None if audit is None else {"ok": audit.ok, **asdict(audit)}
+            rows.append({"ok": report.ok, **asdict(report), "split": split})
+            continue
         _print_check(report)
-    return 0 if all(report.ok for report in reports) else 1
+        if audit is not None:
+            _print_audit(audit)
+    if args.json:
+        print_json(rows)
+    if sound:
+        say_next("hwp-bench", "evaluate", "plain", "--capture", *args.captures)
+    return 0 if sound else 1
 
 
 def _print_check(report: CheckReport) -> None:
@@ -62,7 +85,12 @@ def _print_check(report: CheckReport) -> None:
         print_table(named_table(title, "fact, value", rows))
     else:
         print(title)
-    for finding in report.findings:
+    print_findings(report.findings)
+
+
+def print_findings(findings: Iterable[Finding]) -> None:
+    """Print what is wrong, a line each."""
+    for finding in findings:
         parts = (finding.level, finding.where, finding.field, finding.problem)
         remedy = f" {finding.remedy}" if finding.remedy else ""
         said = ": ".join(part for part in parts if part)
@@ -82,7 +110,7 @@ def _fact(value: object) -> str:
 
 _SHOW = """examples:
   hwp-bench data show my_capture
-  hwp-bench data show my_capture -o sheet.png --count 48 --edge 192
+  hwp-bench data show my_capture -o sheet.png --frame-count 48 --edge 192
 
 The sheet shows frames evenly over the capture: green the visible-hand mask, orange the right
 and blue the left estimated hand; over each frame its number and the severity of what perturbs
@@ -95,7 +123,7 @@ def _add_show(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("capture", metavar="CAPTURE", help="capture folder")
     add("-o", "--out", help="PNG to write (default: ID-sheet.png here)")
-    add("--count", type=int, default=24, help="frames on the sheet (default 24)")
+    add("--frame-count", type=int, default=24, metavar="N", help="frames on it (default 24)")
     add("--edge", type=int, default=256, help="larger side of a frame, px (default 256)")
 
 
@@ -104,54 +132,27 @@ def _show(args: argparse.Namespace) -> int:
     from hwp_bench.capture import open_capture
     from hwp_bench.capture.check import contact_sheet
 
-    if args.count < 1 or not 16 <= args.edge <= 2048:
-        raise UsageError("at least one frame, of 16 to 2048 px, is drawn", field="--count, --edge")
+    count = args.frame_count
+    if count < 1 or not 16 <= args.edge <= 2048:
+        text = "at least one frame, of 16 to 2048 px, is drawn"
+        raise UsageError(text, field="--frame-count, --edge")
     capture = open_capture(args.capture)
     out = Path(args.out or f"{capture.info.id}-sheet.png")
     check_places({"--out": out}, {"CAPTURE": args.capture})
-    print(write_image(out, contact_sheet(capture, count=args.count, edge=args.edge)))
+    print(write_image(out, contact_sheet(capture, count=count, edge=args.edge)))
     return 0
 
 
-_AUDIT = """examples:
-  hwp-bench data audit my_capture
-  hwp-bench data audit my_capture --guard 15
-  hwp-bench data audit captures/* --splits splits/hwp-v1.json --json
-
-Exit status 0: parts are disjoint and no test frame is known to be perturbed; 1: otherwise.
-Near-copies across the border are reported and do not change the status.
-"""
-
-
-def _add_audit(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = _AUDIT
-    parser.add_argument("captures", nargs="+", metavar="CAPTURE", help="capture folder")
-    add_splits(parser)
-    guard = "frames left out before each border (default 0)"
-    parser.add_argument("--guard", type=int, default=0, help=guard)
-    add_json(parser, "print the reports as JSON")
-
-
-def _audit(args: argparse.Namespace) -> int:
+def _audit(path: str, splits: Mapping[str, Split] | None, guard: int) -> AuditReport:
     from hwp_bench.capture import open_capture
     from hwp_bench.capture.splits import audit_split, contiguous_split, split_for
 
-    if args.guard < 0 or (args.guard and args.splits):
-        raise UsageError("a guard gap is at least 0, and not for a split file", field="--guard")
-    splits = splits_of(args)
-    reports = []
-    for path in track(args.captures, "auditing splits"):
-        capture = open_capture(path)
-        if splits is None:
-            split = contiguous_split(capture.info.id, len(capture), guard=args.guard)
-        else:
-            split = split_for(capture.info.id, len(capture), splits)
-        reports.append(audit_split(capture, split))
-    if args.json:
-        print_json([{"ok": report.ok, **asdict(report)} for report in reports])
-    for report in () if args.json else reports:
-        _print_audit(report)
-    return 0 if all(report.ok for report in reports) else 1
+    capture = open_capture(path)
+    if splits is None:
+        split = contiguous_split(capture.info.id, len(capture), guard=guard)
+    else:
+        split = split_for(capture.info.id, len(capture), splits)
+    return audit_split(capture, split)
 
 
 def _print_audit(report: AuditReport) -> None:
@@ -234,6 +235,7 @@ def _get(args: argparse.Namespace) -> int:
         f"folder: {folder}, {len(files)} files, {made.kept} of them existed before",
         f"commit: {made.commit}",
     )
+    say_next("hwp-bench", "data", "import", "wildghand", folder, "-o", "captures")
     return print_result(args.json, value, lines)
 
 
@@ -245,6 +247,7 @@ def _get_clips(args: argparse.Namespace) -> int:
     lines += [f"missing: {clip}" for clip in missing]
     value = {"captures": [str(folder) for folder in folders], "missing": dict(missing)}
     print_result(args.json, value, lines)
+    say_next("hwp-bench", "evaluate", "plain", "--suite", args.name)
     return int(bool(missing))
 
 
@@ -255,7 +258,7 @@ _TRACK = """examples:
   hwp-bench data track --fetch
 
 Needs ai-edge-litert: pip install 'hwp-bench[track]'. The networks are those of MediaPipe 0.10.21.
-They are downloaded once (36 MB, of which 8 MB are kept). `hwp-bench data import-video` reads the
+They are downloaded once (36 MB, of which 8 MB are kept). `hwp-bench data import video` reads the
 result; docs/video.md describes it.
 """
 
@@ -269,13 +272,13 @@ def _add_track(parser: argparse.ArgumentParser) -> None:
     add("-o", "--out", type=Path, metavar="NPZ", help=out)
     hands = "most hands in a frame (default: 2)"
     add("--hands", type=int, choices=(1, 2), default=2, help=hands)
-    least = "palms and hands below this are left out (default: 0.5)"
-    add("--min-confidence", type=float, default=0.5, metavar="P", help=least)
+    least = "palms and hands of a lower score are left out (default: 0.5)"
+    add("--min-score", type=float, default=0.5, metavar="S", help=least)
     model = "networks: a hand_landmarker.task, a wheel of MediaPipe 0.10.21, or a folder"
     add("--model", type=Path, metavar="FILE", help=model)
     add("--sheet", type=Path, metavar="IMAGE", help="draw a contact sheet")
     add("--fetch", action="store_true", help="download the networks and say where they are")
-    add("--force", action="store_true", help="replace an existing file")
+    add_overwrite(parser, "an existing file")
     add_json(parser, "print the numbers as JSON")
 
 
@@ -290,13 +293,13 @@ def _track(args: argparse.Namespace) -> int:
     out = args.out or args.video.with_suffix(".npz")
     outputs = {"--out": out, "--sheet": args.sheet}
     check_places(outputs, {"VIDEO": args.video, "--model": args.model})
-    least = args.min_confidence
+    least = args.min_score
     tracked = track_video(
         args.video,
         out,
         settings=TrackerSettings(args.hands, min_palm_score=least, min_presence=least),
         model=args.model,
-        overwrite=args.force,
+        overwrite=args.overwrite,
     )
     if args.sheet is not None:
         from hwp_bench.base.images import write_image
@@ -313,6 +316,8 @@ def _track(args: argparse.Namespace) -> int:
         f"score {hand['mean_score']:.3f}; votes: right {hand['right']:.2f}, left {hand['left']:.2f}"
         for hand in facts["hands"]
     ]
+    words = ("hwp-bench", "data", "import", "video", args.video, "--landmarks", out, "-o")
+    say_next(*words, args.video.with_suffix(""))
     return print_result(args.json, {"landmarks": str(out), **facts}, lines)
 
 
@@ -365,7 +370,7 @@ def _inputs(args: argparse.Namespace) -> int:
 
 
 _CARD = """examples:
-  hwp-bench data card mini > mini.json
+  hwp-bench dev card mini > mini.json
 
 Croissant 1.0 (JSON-LD): captures with hands, perturbations, frames, split and digests, licence, and
 for real clips the addresses of the videos with their SHA-256. Nothing is rendered or downloaded.
@@ -384,85 +389,9 @@ def _card(args: argparse.Namespace) -> int:
     return 0
 
 
-_PUBLISH = """examples:
-  hwp-bench data publish captures/* -o publication
-  hwp-bench data publish captures/* -o publication --splits splits/mine.json
-  hwp-bench evaluate submission/ --sealed publication/sealed
-
-publication/public goes to authors: training and validation frames, and the hand parameters and
-cameras of every frame. publication/sealed stays with the keeper: it holds the test frames, and the
-salt of the commitment that the public manifest carries.
-"""
-
-
-def _add_publish(parser: argparse.ArgumentParser) -> None:
-    parser.description = "Divide captures into a public and a sealed part."
-    parser.epilog = _PUBLISH
-    captures = "capture folders"
-    parser.add_argument("captures", nargs="+", type=Path, metavar="CAPTURES", help=captures)
-    add_out(parser, "folder to make")
-    add_splits(parser)
-    add_json(parser, "print what was written as JSON")
-
-
-def _publish(args: argparse.Namespace) -> int:
-    from hwp_bench.commitments import publish
-
-    check_places({"--out": args.out}, {"CAPTURES": args.captures, "--splits": args.splits})
-    made = publish(args.captures, args.out, splits=splits_of(args))
-    value = {
-        "public": str(made.public),
-        "sealed": str(made.sealed),
-        "commitment": made.commitment,
-        "captures": list(made.captures),
-    }
-    lines = (
-        f"captures: {', '.join(made.captures)}",
-        f"for authors: {made.public}",
-        f"keep secret: {made.sealed}",
-        f"commitment: {made.commitment}",
-    )
-    return print_result(args.json, value, lines)
-
-
-_SECOND_VIEW = """examples:
-  hwp-bench data second-view front side --calibration cameras.toml     # captures of two videos
-  hwp-bench data second-view cam400015 cam400016                       # of a data set
-
-What the second camera saw at the same time becomes the free-view clip of CAPTURE, whose scores are
-apart. docs/video.md describes the calibration file.
-"""
-
-
-def _add_second_view(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = _SECOND_VIEW
-    add = parser.add_argument
-    add("capture", type=Path, metavar="CAPTURE", help="capture folder, which gets the clip")
-    add("second", type=Path, metavar="SECOND", help="capture of the second camera")
-    text = "where both cameras are; needed for videos"
-    add("--calibration", type=Path, metavar="TOML", help=text)
-    add("--force", action="store_true", help="replace an existing clip")
-    add_json(parser, "print the numbers as JSON")
-
-
-def _second_view(args: argparse.Namespace) -> int:
-    from hwp_bench.capture import open_capture
-    from hwp_bench.importers.second_view import add_second_view, read_calibration
-
-    calibration = None if args.calibration is None else read_calibration(args.calibration)
-    captures = open_capture(args.capture), open_capture(args.second)
-    made = add_second_view(*captures, calibration, overwrite=args.force)
-    place = args.capture / "free"
-    lines = [f"free-view clip: {place}, {len(made.frames)} frames"]
-    if made.scale is not None:
-        lines.append(f"scale: a metre of the capture is {made.scale:.3f} m")
-    lines.append(f"landmarks: {made.distance_px:.2f} px from where the second camera saw them")
-    return print_result(args.json, {"clip": str(place), **asdict(made)}, lines)
-
-
 _CONVERT = """examples:
-  hwp-bench hands convert my_capture as_mano --hand-model mano:mano_v1_2/models
-  hwp-bench hands convert mano_capture as_free --hand-model anny --json
+  hwp-bench data convert my_capture -o as_mano --hand-model mano:mano_v1_2/models
+  hwp-bench data convert mano_capture -o as_free --hand-model anny --json
 
 Writes the capture again with its hands in another hand model, by fitting, and prints the errors
 of the fit. True hand parameters are left out: they belong to the old model.
@@ -474,9 +403,9 @@ def _add_convert(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _CONVERT
     add = parser.add_argument
     add("capture", type=Path, metavar="CAPTURE", help="capture folder")
-    add("out", type=Path, metavar="OUT", help="capture folder to make")
+    add_out(parser, "capture folder to make")
     add("--hand-model", required=True, metavar="MODEL", help="anny, mano:PATH or mano-hd:PATH")
-    add_force(parser)
+    add_overwrite(parser, "an existing capture")
     add_json(parser, "print the errors as JSON")
 
 
@@ -485,9 +414,9 @@ def _convert(args: argparse.Namespace) -> int:
     from hwp_bench.capture.convert import convert_capture
 
     inputs = {"CAPTURE": args.capture}
-    check_places({"OUT": args.out}, inputs, replaces=args.force, makes_captures=True)
+    check_places({"--out": args.out}, inputs, replaces=args.overwrite, makes_captures=True)
     capture = open_capture(args.capture)
-    errors = convert_capture(capture, args.out, args.hand_model, overwrite=args.force)
+    errors = convert_capture(capture, args.out, args.hand_model, overwrite=args.overwrite)
     lines = [
         f"{side} hand: skin {error.skin_mm:.2f} mm (worst frame {error.worst_skin_mm:.2f}), "
         f"landmarks {error.landmark_mm:.2f} mm"
@@ -498,9 +427,9 @@ def _convert(args: argparse.Namespace) -> int:
 
 
 _EXPORT = """examples:
-  hwp-bench hands export my_capture hand.glb              # the estimated hands of frame 0
-  hwp-bench hands export my_capture hand.obj --frame 12
-  hwp-bench hands export simulated hand.ply --frame 12 --truth
+  hwp-bench data export my_capture -o hand.glb              # the estimated hands of frame 0
+  hwp-bench data export my_capture -o hand.obj --frame 12
+  hwp-bench data export simulated -o hand.ply --frame 12 --truth
 
 The ending of the file says the format: .glb, .obj, .ply or .stl. Coordinates are in m, in the
 world of the cameras.
@@ -512,7 +441,7 @@ def _add_export(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EXPORT
     add = parser.add_argument
     add("capture", type=Path, metavar="CAPTURE", help="capture folder")
-    add("out", type=Path, metavar="FILE", help="mesh file to write")
+    add_out(parser, "mesh file to write", "FILE")
     add("--frame", type=int, default=0, help="index of the frame (default 0)")
     add("--truth", action="store_true", help="the true hands of a simulated capture")
 
@@ -521,7 +450,7 @@ def _export(args: argparse.Namespace) -> int:
     from hwp_bench.capture import open_capture
     from hwp_bench.capture.convert import hand_meshes, write_meshes
 
-    check_places({"FILE": args.out}, {"CAPTURE": args.capture})
+    check_places({"--out": args.out}, {"CAPTURE": args.capture})
     meshes = hand_meshes(open_capture(args.capture), args.frame, truth=args.truth)
     path = write_meshes(meshes, args.out)
     count = sum(len(mesh.vertices) for mesh in meshes.values())
@@ -533,13 +462,10 @@ def _export(args: argparse.Namespace) -> int:
 COMMANDS = {
     "check": (_add_check, _check),
     "show": (_add_show, _show),
-    "audit": (_add_audit, _audit),
     "get": (_add_get, _get),
     "track": (_add_track, _track),
     "inputs": (_add_inputs, _inputs),
     "card": (_add_card, _card),
-    "publish": (_add_publish, _publish),
-    "second_view": (_add_second_view, _second_view),
     "convert": (_add_convert, _convert),
     "export": (_add_export, _export),
 }

@@ -1,4 +1,4 @@
-"""Commands that run methods: `evaluate`, `ablate`, `budget` and `demo`."""
+"""Commands that run methods: `evaluate`, `ablate`, `error-budget` and `demo`."""
 
 from __future__ import annotations
 
@@ -16,9 +16,11 @@ from hwp_bench.base.tables import Column, Table, print_table, to_object, write_t
 from hwp_bench.cli.options import (
     SEVERAL,
     add_json,
+    add_overwrite,
     add_suite_or_captures,
     overrides,
     print_json,
+    say_next,
     splits_of,
 )
 from hwp_bench.run.engine.options import add_engine_arguments
@@ -37,7 +39,7 @@ _EVALUATE = """examples:
   hwp-bench evaluate baselines/plain --capture my_capture --out runs/plain-mine
   hwp-bench evaluate my_method --suite mini --budget 60 --seed 1
   hwp-bench evaluate my_method --suite mini --set gaussians=20000 --json
-  hwp-bench evaluate baselines/plain --suite mini --frames clean     # upper bound
+  hwp-bench evaluate baselines/plain --suite mini --train-on clean   # upper bound
   hwp-bench evaluate submission --sealed publication/sealed
   hwp-bench evaluate authors --capture compat/capture0     # after `data import rendered`
   hwp-bench evaluate my_method --suite mini --jobs 4                 # four captures at once
@@ -53,13 +55,13 @@ replaced once all new ones are there.
 Exit status 0: every frame was scored; 1: the method failed on a capture or left out frames
 (they get the protocol's penalty); 2: the command line is wrong.
 """
-_METHOD_HELP = "method directory, or the name of a shipped method"
+METHOD_HELP = "method directory, or the name of a shipped method"
 
 
 def _add_evaluate(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EVALUATE
     add = parser.add_argument
-    add("methods", nargs="+", metavar="METHOD_DIR", help=_METHOD_HELP)
+    add("methods", nargs="+", metavar="METHOD_DIR", help=METHOD_HELP)
     _add_evaluation(parser)
     sealed = "sealed part of a publication, instead of captures; checked against its commitment"
     add("--sealed", metavar="DIR", help=sealed)
@@ -82,7 +84,7 @@ def _add_evaluation(parser: argparse.ArgumentParser) -> None:
     add("--set", action="append", default=[], metavar="NAME=VALUE", help=text)
     kinds = ("perturbed", "clean", "unperturbed-only")
     text = "training frames to use; all but the first are oracles on simulated captures"
-    add("--frames", choices=kinds, default="perturbed", help=text)
+    add("--train-on", choices=kinds, default="perturbed", help=text)
     text = "limit of the fit's time; without --steps it lifts the preset's limit of steps"
     add("--budget", type=float, metavar="SECONDS", help=text)
     add("--steps", type=int, help="limit of the fit's optimizer steps")
@@ -100,8 +102,7 @@ def _add_evaluation(parser: argparse.ArgumentParser) -> None:
         "environment of another Python"
     )
     add("--expose", **SEVERAL, metavar="PATH", help=text)
-    text = "replace results of another evaluation in the folder, once the new ones are whole"
-    add("--overwrite", action="store_true", help=text)
+    add_overwrite(parser, "results of another evaluation, once the new ones are whole")
     add_engine_arguments(parser)
 
 
@@ -132,7 +133,12 @@ def _evaluate(args: argparse.Namespace) -> int:
             # Captures of a person's own may have no perturbation to speak of.
             if len(tables[name].columns) > 1:
                 print_table(tables[name])
-    return _report_outcome(out, results)
+    status = _report_outcome(out, results)
+    if status:
+        say_next("hwp-bench", "check-method", method)
+    else:
+        say_next("hwp-bench", "report", out, "-o", Path("reports") / out.name)
+    return status
 
 
 class Call(NamedTuple):
@@ -187,6 +193,9 @@ def _evaluate_several(
     elif table is not None:
         print_table(table)
     notice(f"results: {out}; more tables: hwp-bench table {out} --by NAME")
+    if len(manifests) > 1:
+        say_next("hwp-bench", "compare", out)
+    say_next("hwp-bench", "report", out, "-o", Path("reports") / out.name)
     return status
 
 
@@ -286,7 +295,7 @@ def _evaluation_settings(args: argparse.Namespace) -> EvaluationSettings:
     return EvaluationSettings(
         suite="captures" if args.capture else args.suite,
         preset=args.preset,
-        run=RunSettings(overrides(args.set), args.seed, budget, args.frames),
+        run=RunSettings(overrides(args.set), args.seed, budget, args.train_on),
         time_limit=args.time_limit,
         confinement=Confinement(
             mode=args.isolation,
@@ -298,44 +307,37 @@ def _evaluation_settings(args: argparse.Namespace) -> EvaluationSettings:
 
 _ABLATE = """examples:
   hwp-bench ablate --suite mini                          # DPD x PAO x pre-pass, three seeds
-  hwp-bench ablate --no-dpd --no-pao                     # DPD x PAO
-  hwp-bench ablate --no-dpd                              # the full method, and without DPD
-  hwp-bench ablate --no-dpd --no-pao --no-heads          # each out of the full method, all out
-  hwp-bench ablate --binary-mask                         # a binary mask in place of PAO's weights
+  hwp-bench ablate --only dpd pao                        # DPD x PAO
+  hwp-bench ablate --without dpd                         # the full method, and without DPD
+  hwp-bench ablate --without dpd pao heads               # each out of the full method, all out
+  hwp-bench ablate --with binary-mask                    # a binary mask in place of PAO's weights
   hwp-bench ablate --only dpd pao heads                  # 2 x 2 x 2
   hwp-bench ablate --base paper                          # the paper's Table 6: no addition of ours
   hwp-bench ablate my_method --without loss --budget 60  # what a third party's method declares
   hwp-bench ablate --suite full --engine ray://10.0.0.1:6379 --job-gpus 1
 
 Which variants are run:
-  no flag         the components that the method names for it, or else the first two that it
+  neither         the components that the method names for it, or else the first two that it
                   declares, crossed: 2^k
   --only A B ...  the named components, crossed: 2^k
-  other flags     the full method; each of the named components out of it (alternatives: put in);
-                  and, of two components or more, all of them out
+  --without A B   the full method; each of the named components out of it; and all of them out
+  --with A        the full method; the named alternative in place of what it does otherwise
 The first row is the barest; a line says which components it keeps. --base NAME takes these out too.
 
 Started again with the same arguments, it takes finished jobs as they are; results of other settings
 are refused, or replaced at the end with --overwrite. Exit status 1: the method failed on a capture
 or left out frames.
 """
-#: Flags of the reference method's switches.
-_FLAGS = {
-    "--no-dpd": ("dpd", "take out the dynamic perturbation disentanglement"),
-    "--no-pao": ("pao", "take out the perturbation-aware optimization"),
-    "--no-heads": ("heads", "take out heads (iii) and (iv)"),
-    "--binary-mask": ("binary-mask", "put a binary mask in place of the weights"),
-}
 
 
 def _add_ablate(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _ABLATE
     add, text = parser.add_argument, "method directory or name (default wildghand)"
     add("method", metavar="METHOD", nargs="?", default="wildghand", help=text)
-    for flag, (name, text) in _FLAGS.items():
-        add(flag, dest="thrown", action="append_const", const=name, help=text)
-    text = "throw a switch of the method's method.toml; may be given again"
-    add("--without", dest="thrown", action="append", metavar="SWITCH", help=text)
+    text = "leave out components of method.toml, such as dpd, pao and heads of wildghand"
+    add("--without", **SEVERAL, metavar="COMPONENT", help=text)
+    text = "use alternatives of method.toml, such as binary-mask of wildghand"
+    add("--with", dest="alternatives", **SEVERAL, metavar="NAME", help=text)
     add("--only", **SEVERAL, metavar="COMPONENT", help="cross these components")
     text = "start from this simpler form that method.toml declares: wildghand has paper, released"
     add("--base", metavar="NAME", help=text)
@@ -355,7 +357,7 @@ def _ablate(args: argparse.Namespace) -> int:
     # A wrong method, setting or switch must be reported before a suite is rendered for it.
     manifest = read_manifest(find_method(args.method))
     check_settings(manifest, settings.run.settings, "--set")
-    design = make_design(manifest, args.thrown or [], args.only, args.base)
+    design = make_design(manifest, [*args.without, *args.alternatives], args.only, args.base)
     based = f"-{args.base}" if args.base else ""
     out = Path(args.out or f"runs/ablation-{manifest.name}-{settings.suite}{based}")
     seeds = range(args.seeds)
@@ -396,6 +398,7 @@ def _report_ablate(ablation: AblationRuns, out: Path, *, as_json: bool) -> int:
                 print_table(tables[name])
     _draw_ablate(ablation, out)
     notice(f"record: {write_record(out, record)}; tables: {out / 'tables'}")
+    say_next("hwp-bench", "report", out, "-o", Path("reports") / out.name)
     status = 0
     for name, runs in ablation.runs.items():
         for seed, result in runs.seeds.items():
@@ -417,10 +420,10 @@ def _draw_ablate(ablation: AblationRuns, out: Path) -> None:
         notice(f"figure: {figure}")
 
 
-_BUDGET = """examples:
-  hwp-bench budget wildghand --suite mini --budget 16 --jobs 2
-  hwp-bench budget baselines/plain --capture my_capture
-  hwp-bench budget my_method --capture capture4 --truths poses test-poses --json
+_ERROR_BUDGET = """examples:
+  hwp-bench error-budget wildghand --suite mini --budget 16 --jobs 2
+  hwp-bench error-budget baselines/plain --capture my_capture
+  hwp-bench error-budget my_method --capture capture4 --truths poses test-poses --json
 
 Each truth that a simulated capture knows replaces one estimate (pixels, masks, poses, test-poses,
 betas, mesh), then all of them do; the method is fitted each time. What a capture does not know is
@@ -430,19 +433,19 @@ Exit status 1: the method failed on a capture or left out frames.
 """
 
 
-def _add_budget(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = _BUDGET
+def _add_error_budget(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = _ERROR_BUDGET
     add = parser.add_argument
-    add("method", metavar="METHOD_DIR", help=_METHOD_HELP)
+    add("method", metavar="METHOD_DIR", help=METHOD_HELP)
     text = "estimates that the truth replaces (default: all that the captures know)"
     add("--truths", nargs="*", metavar="NAME", help=text)
     _add_evaluation(parser)
-    add("-o", "--out", help="folder (default runs/budget-METHOD-SUITE)")
+    add("-o", "--out", help="folder (default runs/error-budget-METHOD-SUITE)")
     add("--seed", type=int, default=0, help="seed of everything random")
     add_json(parser, "print the record, budget.json")
 
 
-def _budget(args: argparse.Namespace) -> int:
+def _error_budget(args: argparse.Namespace) -> int:
     from hwp_bench.evaluation.budget.budget import check_oracle_inputs, run_budget
     from hwp_bench.methods.manifest import find_method, read_manifest
     from hwp_bench.methods.request import ORACLE_INPUTS
@@ -451,7 +454,7 @@ def _budget(args: argparse.Namespace) -> int:
     manifest = read_manifest(find_method(args.method))
     truths = tuple(ORACLE_INPUTS) if args.truths is None else args.truths
     check_oracle_inputs(truths, settings)
-    out = Path(args.out or f"runs/budget-{manifest.name}-{settings.suite}")
+    out = Path(args.out or f"runs/error-budget-{manifest.name}-{settings.suite}")
     with _running(args, [Call(manifest, settings, out)]) as (captures, jobs, options):
 
         def on_run(index: int, count: int, name: str) -> OnCapture | None:
@@ -459,10 +462,10 @@ def _budget(args: argparse.Namespace) -> int:
             return jobs.turn if jobs else None
 
         runs = run_budget(args.method, captures, out, settings, truths, on_run=on_run, **options)
-    return _report_budget(runs, out, as_json=args.json)
+    return _report_error_budget(runs, out, as_json=args.json)
 
 
-def _report_budget(runs: BudgetRuns, out: Path, *, as_json: bool) -> int:
+def _report_error_budget(runs: BudgetRuns, out: Path, *, as_json: bool) -> int:
     from hwp_bench.base.files import write_json
     from hwp_bench.base.images import write_image
     from hwp_bench.evaluation.budget.budget import (
@@ -494,7 +497,7 @@ def _report_budget(runs: BudgetRuns, out: Path, *, as_json: bool) -> int:
 
 _DEMO = """examples:
   hwp-bench demo
-  hwp-bench demo --out my-demo
+  hwp-bench demo -o my-demo
   hwp-bench demo --methods plain my_method/
 
 Renders the two captures of the smoke suite, fits the plain baseline and WildGHand to their
@@ -507,11 +510,10 @@ finished fits as they are.
 def _add_demo(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _DEMO
     add = parser.add_argument
-    add("--out", default="hwp-demo", help="folder to write (default hwp-demo)")
+    add("-o", "--out", default="hwp-demo", help="folder to write (default hwp-demo)")
     text = "methods to run: directories or shipped names (default plain wildghand)"
     add("--methods", nargs="+", default=["plain", "wildghand"], metavar="METHOD", help=text)
-    text = "replace results of other versions of the methods in the folder"
-    add("--overwrite", action="store_true", help=text)
+    add_overwrite(parser, "results of other versions of the methods in the folder")
 
 
 def _demo(args: argparse.Namespace) -> int:
@@ -554,6 +556,7 @@ def _demo(args: argparse.Namespace) -> int:
     picture = out / "side-by-side.png"
     write_side_by_side(picture, sources, [open_capture(capture) for capture in captures])
     notice(f"truth and methods side by side: {picture}; tables: {out / 'tables'}")
+    say_next("hwp-bench", "new", "my_method")
     return status
 
 
@@ -561,6 +564,6 @@ def _demo(args: argparse.Namespace) -> int:
 COMMANDS = {
     "evaluate": (_add_evaluate, _evaluate),
     "ablate": (_add_ablate, _ablate),
-    "budget": (_add_budget, _budget),
+    "error-budget": (_add_error_budget, _error_budget),
     "demo": (_add_demo, _demo),
 }

@@ -1,19 +1,22 @@
-"""Commands that take other data in: `data import ...` and `data import-video`."""
+"""Commands that take other data in: `data import ...`."""
 
 from __future__ import annotations
 
 import argparse
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hwp_bench.base.console import notice
 from hwp_bench.base.files import check_places
 from hwp_bench.cli.options import (
-    add_force,
     add_json,
+    add_out,
+    add_overwrite,
     add_splits,
     print_json,
     print_result,
+    say_next,
     splits_of,
 )
 
@@ -22,9 +25,9 @@ if TYPE_CHECKING:
 
 _VIDEO = """examples:
   hwp-bench data track hand.mp4
-  hwp-bench data import-video hand.mp4 --landmarks hand.npz my_capture
-  hwp-bench data import-video hand.mp4 --landmarks hand.npz my_capture --focal 1020 --side left
-  hwp-bench data import-video hand.mp4 --landmarks hand.npz part --frames 100:400 --stride 2
+  hwp-bench data import video hand.mp4 --landmarks hand.npz -o my_capture
+  hwp-bench data import video hand.mp4 --landmarks hand.npz -o my_capture --focal 1020 --side left
+  hwp-bench data import video hand.mp4 --landmarks hand.npz -o part --range 100:400 --stride 2
 
 LANDMARKS.npz comes from `hwp-bench data track` or another hand tracker and contains, for every
 frame of the video, image (F, 21, 2 or 3) in pixels, world (F, 21, 3) in metres and score (F,) in
@@ -37,18 +40,15 @@ def _add_video(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _VIDEO
     add = parser.add_argument
     add("video", type=Path, metavar="VIDEO", help="video file")
-    add("out", type=Path, metavar="OUT", help="capture folder to make")
+    add_out(parser, "capture folder to make")
     landmarks = "tracked landmarks"
     add("--landmarks", type=Path, required=True, metavar="LANDMARKS.npz", help=landmarks)
     _add_side(parser, "one or both, as the landmarks and a fit to them show")
-    # The name of the option until it took two hands.
-    hidden = argparse.SUPPRESS
-    add("--hand", dest="side", choices=("right", "left"), default=hidden, help=hidden)
     focal = "focal length of the whole frame; else estimated"
     add("--focal", type=float, metavar="PX", help=focal)
     add("--masks", type=Path, metavar="DIR", help="your own masks, named by frame number")
     _add_size(parser)
-    add("--frames", metavar="A:B", help="only frames A to B-1")
+    add("--range", metavar="A:B", help="only frames A to B-1")
     stride = "every K-th frame (default: 1)"
     add("--stride", type=int, default=1, metavar="K", help=stride)
     score = "below this score a frame counts as without a hand (default: 0.5)"
@@ -61,7 +61,7 @@ def _add_video(parser: argparse.ArgumentParser) -> None:
     add("--licence", default="unknown", metavar="TEXT", help="terms of use")
     names = "perturbations in the clip, comma separated; their severities stay unknown"
     add("--perturbations", default="", metavar="NAMES", help=names)
-    add_force(parser)
+    add_overwrite(parser, "an existing capture")
     add_json(parser, "print the numbers as JSON")
 
 
@@ -84,24 +84,26 @@ def _video(args: argparse.Namespace) -> int:
     )
 
     inputs = {"VIDEO": args.video, "--landmarks": args.landmarks, "--masks": args.masks}
-    outputs = {"OUT": args.out, "--sheet": args.sheet}
-    check_places(outputs, inputs, replaces=args.force, makes_captures=True)
+    outputs = {"--out": args.out, "--sheet": args.sheet}
+    check_places(outputs, inputs, replaces=args.overwrite, makes_captures=True)
     given = ("side", "focal", "masks", "size", "id", "action", "device", "licence", "hand_model")
     options = VideoImport(
         **{name: getattr(args, name) for name in (*given, "min_score", "sheet")},
-        frames=parse_frame_range(args.frames, args.stride),
+        frames=parse_frame_range(args.range, args.stride),
         perturbations=tuple(name for name in args.perturbations.split(",") if name),
-        overwrite=args.force,
+        overwrite=args.overwrite,
     )
     finished = read_finished_import(args.video, args.landmarks, args.out, options)
     if finished is not None:
-        notice(f"{args.out} is complete: the same call has made it; --force imports again")
+        notice(f"{args.out} is complete: the same call has made it; --overwrite imports again")
         return print_result(args.json, finished, [f"capture: {args.out}"])
     clip = import_video(args.video, args.landmarks, args.out, options)
     if args.json:
         print_json(clip.facts())
     else:
         _print_video(clip, args)
+    say_next("hwp-bench", "data", "check", args.out)
+    say_next("wildghand", "fit", args.out, "-o", f"{args.out}_avatar")
     return 0
 
 
@@ -156,13 +158,13 @@ and its error is printed in mm. docs/data.md describes every step from the downl
 
 def _add_out_and_mano(parser: argparse.ArgumentParser) -> None:
     add, text = parser.add_argument, "your MANO files; without them the free hand is fitted"
-    add("-o", "--out", type=Path, required=True, metavar="OUT", help="capture folder to make")
+    add_out(parser, "capture folder to make")
     add("--mano", type=Path, metavar="MANO_DIR", help=text)
 
 
 def _check_release_places(args: argparse.Namespace) -> None:
     inputs = {"DIR": args.folder, "--mano": args.mano}
-    check_places({"--out": args.out}, inputs, replaces=args.force, makes_captures=True)
+    check_places({"--out": args.out}, inputs, replaces=args.overwrite, makes_captures=True)
 
 
 def _add_wildghand(parser: argparse.ArgumentParser) -> None:
@@ -173,12 +175,12 @@ def _add_wildghand(parser: argparse.ArgumentParser) -> None:
     _add_out_and_mano(parser)
     compat = "crop, intrinsics and translations as in the released loader"
     add("--official-compat", action="store_true", help=compat)
-    add("--hand", choices=("right", "left"), help="the hand of a single-hand capture")
+    add("--side", choices=("right", "left"), help="the hand of a single-hand capture")
     add("--id", metavar="ID", help="capture id (default: by the folder's name)")
     _add_size(parser)
     fps = "frame rate of the video before subsampling (default: 30)"
     add("--fps", type=float, default=30.0, help=fps)
-    add_force(parser)
+    add_overwrite(parser, "an existing capture")
     add_json(parser, "print the facts as JSON")
 
 
@@ -190,10 +192,10 @@ def _wildghand(args: argparse.Namespace) -> int:
     options = OfficialImport(
         mano=args.mano,
         official_compat=args.official_compat,
-        hand=args.hand,
+        hand=args.side,
         size=args.size,
         video_fps=args.fps,
-        overwrite=args.force,
+        overwrite=args.overwrite,
     )
     folders = find_folders(args.folder, args.id)
     several = folders[0].path != args.folder
@@ -204,6 +206,7 @@ def _wildghand(args: argparse.Namespace) -> int:
         for warning in facts["warnings"]:
             notice(f"warning: {folder.path}: {warning}")
         results.append({"out": str(out), **facts})
+    say_next("hwp-bench", "data", "check", *(facts["out"] for facts in results))
     return print_result(args.json, results, [line for r in results for line in _official_lines(r)])
 
 
@@ -240,7 +243,7 @@ def _add_interhand26m(parser: argparse.ArgumentParser) -> None:
     fps = "frame rate of the annotated frames, 5 or 30 (default: 5)"
     add("--fps", type=float, default=5.0, help=fps)
     _add_side(parser, "those that the sequence is listed with")
-    add_force(parser)
+    add_overwrite(parser, "an existing capture")
     add_json(parser, "print the facts as JSON")
 
 
@@ -249,7 +252,7 @@ def _interhand26m(args: argparse.Namespace) -> int:
 
     _check_release_places(args)
     options = InterHandImport(
-        mano=args.mano, size=args.size, fps=args.fps, side=args.side, overwrite=args.force
+        mano=args.mano, size=args.size, fps=args.fps, side=args.side, overwrite=args.overwrite
     )
     facts = import_interhand(args.folder, find_sequence(args.sequence), args.out, options)
     lines = [f"capture: {args.out}, {facts['frames']} frames of {facts['split']}"]
@@ -258,6 +261,7 @@ def _interhand26m(args: argparse.Namespace) -> int:
         seen = f"in {error['frames_valid']} frames"
         lines.append(f"{side} hand: {seen}, joints {joints} from the annotated")
     lines.append(f"look at: {args.out}/extra/overlay.png")
+    say_next("hwp-bench", "data", "check", args.out)
     return print_result(args.json, {"out": str(args.out), **facts}, lines)
 
 
@@ -280,29 +284,26 @@ def _add_rendered(parser: argparse.ArgumentParser) -> None:
     add("folder", type=Path, metavar="DIR", help="folder of an experiment of theirs")
     text = "the capture that they were drawn for"
     add("--capture", type=Path, required=True, metavar="CAPTURE", help=text)
-    add("-o", "--out", type=Path, required=True, metavar="OUT", help="method directory to fill")
+    add_out(parser, "method directory to fill")
     name = "short name of the method in tables (default: authors-code)"
     add("--name", default="authors-code", help=name)
     add_splits(parser)
-    text = "replace the predictions of that capture"
-    add("--force", action="store_true", help=text)
+    add_overwrite(parser, "the predictions of that capture")
     add_json(parser, "print the facts as JSON")
 
 
 def _rendered(args: argparse.Namespace) -> int:
-    from dataclasses import asdict
-
     from hwp_bench.capture import open_capture
     from hwp_bench.capture.splits import split_for
-    from hwp_bench.commitments.inputs import check_name
     from hwp_bench.importers.official.rendered import import_rendered
+    from hwp_bench.methods.template import check_name
 
     inputs = {"DIR": args.folder, "--capture": args.capture, "--splits": args.splits}
     check_places({"--out": args.out}, inputs)
-    check_name(args.name)
+    check_name(args.name, "--name")
     capture = open_capture(args.capture)
     split = split_for(capture.info.id, capture.info.frame_count, splits_of(args))
-    more = {"name": args.name, "overwrite": args.force}
+    more = {"name": args.name, "overwrite": args.overwrite}
     made = import_rendered(args.folder, capture, split, args.out, **more)
     for warning in made.warnings():
         notice(f"warning: {warning}")
@@ -317,10 +318,46 @@ def _rendered(args: argparse.Namespace) -> int:
     return print_result(args.json, facts, lines)
 
 
+_SECOND_VIEW = """examples:
+  hwp-bench data import second-view front side --calibration cameras.toml   # of two videos
+  hwp-bench data import second-view cam400015 cam400016                     # of a data set
+
+What the second camera saw at the same time becomes the free-view clip of CAPTURE, whose scores are
+apart. docs/video.md describes the calibration file.
+"""
+
+
+def _add_second_view(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = _SECOND_VIEW
+    add = parser.add_argument
+    add("capture", type=Path, metavar="CAPTURE", help="capture folder, which gets the clip")
+    add("second", type=Path, metavar="SECOND", help="capture of the second camera")
+    text = "where both cameras are; needed for videos"
+    add("--calibration", type=Path, metavar="TOML", help=text)
+    add_overwrite(parser, "an existing clip")
+    add_json(parser, "print the numbers as JSON")
+
+
+def _second_view(args: argparse.Namespace) -> int:
+    from hwp_bench.capture import open_capture
+    from hwp_bench.importers.second_view import add_second_view, read_calibration
+
+    calibration = None if args.calibration is None else read_calibration(args.calibration)
+    captures = open_capture(args.capture), open_capture(args.second)
+    made = add_second_view(*captures, calibration, overwrite=args.overwrite)
+    place = args.capture / "free"
+    lines = [f"free-view clip: {place}, {len(made.frames)} frames"]
+    if made.scale is not None:
+        lines.append(f"scale: a metre of the capture is {made.scale:.3f} m")
+    lines.append(f"landmarks: {made.distance_px:.2f} px from where the second camera saw them")
+    return print_result(args.json, {"clip": str(place), **asdict(made)}, lines)
+
+
 #: The arguments and the work of each command, where `main` looks for them.
 COMMANDS = {
     "video": (_add_video, _video),
     "wildghand": (_add_wildghand, _wildghand),
     "interhand26m": (_add_interhand26m, _interhand26m),
     "rendered": (_add_rendered, _rendered),
+    "second-view": (_add_second_view, _second_view),
 }

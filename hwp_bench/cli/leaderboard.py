@@ -1,9 +1,9 @@
-"""`hwp-bench leaderboard`."""
+"""`hwp-bench leaderboard` and `hwp-bench dev leaderboard`."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,28 +13,14 @@ from hwp_bench.base.errors import UsageError, has_odd_characters, shown
 from hwp_bench.base.files import check_places
 from hwp_bench.base.packages import data_folder
 from hwp_bench.base.tables import print_table, to_object
-from hwp_bench.cli.options import SEVERAL, add_actions, add_json, captures_of, print_json
+from hwp_bench.cli.options import SEVERAL, add_json, add_out, captures_of, print_json
 
 if TYPE_CHECKING:
     from hwp_bench.leaderboard.entries import Entry, Submission
 
-_EXAMPLES = """examples:
-  hwp-bench leaderboard submit runs/mine-mini -o submission --by "A. Person"
-  hwp-bench leaderboard submit runs/mine-mini -o submission --link code=https://example.org/mine
-  hwp-bench leaderboard show                                      # the board on the terminal
-  hwp-bench leaderboard check
-  hwp-bench leaderboard confirm runs/mine-mini --by maintainers   # score again, or a second run
-  hwp-bench leaderboard contest mine-mini-seed0-0123abcd runs/again --by me --reason "4 dB lower"
-  hwp-bench leaderboard build -o site
-  hwp-bench leaderboard build -o site --with runs/mine-mini       # reports with images
-
-An entry is a whole result file with its digest. Only results of a whole suite, on perturbed frames
-and in this version's protocols are taken. The site is static: copy the folder anywhere.
-docs/submissions.md says how a row gets on the board and what its level and badge mean.
-"""
 _ADD = """examples:
-  hwp-bench leaderboard add runs/mine-mini
-  hwp-bench leaderboard add runs/* --entries board/entries
+  hwp-bench dev leaderboard add runs/mine-mini
+  hwp-bench dev leaderboard add runs/* --entries board/entries
 
 For the maintainers of a board: writes into its folder. Others make a submission.
 """
@@ -52,7 +38,7 @@ scores, level and badge, and a sentence that says who wins and how surely. Each 
 of its newest entries that were checked furthest; rows that lack captures have no rank.
 """
 _SUBMIT = """examples:
-  hwp-bench leaderboard submit runs/mine-mini -o submission --by "A. Person"
+  hwp-bench leaderboard submit runs/mine-mini -o submission --author "A. Person"
   hwp-bench leaderboard submit runs/mine-* -o submission --link code=https://example.org/mine
   hwp-bench leaderboard submit runs/mine-mini -o submission --avatars avatars/mine-mini
   hwp-bench leaderboard submit runs/new -o submission --revises mine-mini-seed0-0123abcd \\
@@ -72,16 +58,16 @@ of the same data. Exit status 0: all is sound; 1: a file is damaged, changed or 
 2: an entry cannot stand with the others.
 """
 _REGISTER = """examples:
-  hwp-bench leaderboard register plain-mini-16s-seed0-0123abcd
+  hwp-bench dev leaderboard register plain-mini-16s-seed0-0123abcd
 
 For the maintainers of a board. The names and titles of methods that ship with the toolkit belong to
 it: an entry that carries one is left out, and `check` refuses it, until its digest is listed in
 names.json, next to the folder of entries. `leaderboard add` lists what it adds.
 """
 _CONFIRM = """examples:
-  hwp-bench leaderboard confirm runs/mine-mini --by maintainers
-  hwp-bench leaderboard confirm runs/second-run --by maintainers --tolerance 0.05
-  hwp-bench leaderboard confirm runs/second-run --by maintainers --entry mine-mini-seed0-0123abcd
+  hwp-bench leaderboard confirm runs/mine-mini --checked-by maintainers
+  hwp-bench leaderboard confirm runs/second-run --checked-by maintainers --tolerance 0.05
+  hwp-bench leaderboard confirm runs/second --checked-by maintainers --entry mine-mini-0123abcd
 
 Checks are never removed. Where checks of an entry contradict each other, the one that differs
 counts until a new check overrules it by name (--overrules, --reason).
@@ -93,10 +79,10 @@ reproduces; 1: it differs (the check says so too); 2: no entry fits.
 """
 
 _CONTEST = """examples:
-  hwp-bench leaderboard contest mine-mini-seed0-0123abcd runs/again --by "B. Person" \\
+  hwp-bench dev leaderboard contest mine-mini-seed0-0123abcd runs/again --checked-by "B. Person" \\
       --reason "the same call gives 4 dB less"
-  hwp-bench leaderboard contest mine-mini-seed0-0123abcd 89abcdef --withdraw rerun \\
-      --by maintainers --reason "it ran without its weights"
+  hwp-bench dev leaderboard contest mine-mini-seed0-0123abcd 89abcdef --withdraw rerun \\
+      --checked-by maintainers --reason "it ran without its weights"
 
 RERUN is another run of the entry's method with the same settings, seed, budget and data. It is
 written whole into a file next to the entry, with both digests, and the row shows the lower score
@@ -108,56 +94,53 @@ more. Both stay in the folder and on the method's page.
 _LINE = 1000
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
-    parser.epilog = _EXAMPLES
-    action = add_actions(parser)
-    add = action("add", "write entries of results into the folder of entries", _add, _ADD)
-    submit = action("submit", "make the folder of a pull request", _submit, _SUBMIT)
-    text = "check digests, protocol version, completeness of entries"
-    check = action("check", text, _check, _CHECK)
-    show = action("show", "print the board: ranks with intervals, levels, badges", _show, _SHOW)
-    confirm = action("confirm", "score an entry again, or compare a second run", _confirm, _CONFIRM)
-    text = "put a re-evaluation next to an entry, or withdraw one of them"
-    against = action("contest", text, _contest, _CONTEST)
-    text = "allow entries the names of methods that ship"
-    register = action("register", text, _register, _REGISTER)
-    build = action("build", "write the static site", _build, _BUILD)
-    text = "folder of the entries (default leaderboard/entries)"
-    for one in (add, submit, check, show, confirm, against, register, build):
-        one.add_argument("--entries", metavar="DIR", help=text)
+def _add_results(parser: argparse.ArgumentParser) -> None:
     text = "results folder or results.json"
-    for taking in (add, submit):
-        taking.add_argument("results", nargs="+", metavar="RESULTS", help=text)
-    _add_submit(submit)
+    parser.add_argument("results", nargs="+", metavar="RESULTS", help=text)
+
+
+def _add_check(parser: argparse.ArgumentParser) -> None:
     text = "entries before: none may be changed or removed"
-    check.add_argument("--against", metavar="DIR", help=text)
-    add_json(check, "print the entries as JSON")
-    show.add_argument("--suite", metavar="NAME", help="only the tables of this suite")
-    add_json(show, "print the tables as JSON")
-    _add_confirm(confirm)
-    against.add_argument("entry", metavar="ENTRY", help="name of the entry")
+    parser.add_argument("--against", metavar="DIR", help=text)
+    add_json(parser, "print the entries as JSON")
+
+
+def _add_show(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--suite", metavar="NAME", help="only the tables of this suite")
+    add_json(parser, "print the tables as JSON")
+
+
+def _add_contest(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("entry", metavar="ENTRY", help="name of the entry")
     text = "results of the other run; with --withdraw the first 8 digits of its digest"
-    against.add_argument("rerun", metavar="RERUN", help=text)
-    against.add_argument("--by", required=True, metavar="NAME", help="who contests or withdraws")
-    against.add_argument("--reason", required=True, metavar="TEXT", help="why")
+    add("rerun", metavar="RERUN", help=text)
+    add("--checked-by", required=True, metavar="NAME", help="who contests or withdraws")
+    add("--reason", required=True, metavar="TEXT", help="why")
     text = "settle the contest: take one of the two out"
-    against.add_argument("--withdraw", choices=("entry", "rerun"), default="", help=text)
-    register.add_argument("names", nargs="+", metavar="ENTRY", help="name of an entry")
-    build.add_argument("-o", "--out", required=True, metavar="DIR", help="folder of the site")
+    add("--withdraw", choices=("entry", "rerun"), default="", help=text)
+
+
+def _add_register(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("names", nargs="+", metavar="ENTRY", help="name of an entry")
+
+
+def _add_build(parser: argparse.ArgumentParser) -> None:
+    add_out(parser, "folder of the site")
     text = "results folders of entries, for the images of their reports"
-    build.add_argument("--with", dest="folders", **SEVERAL, metavar="RESULTS", help=text)
+    parser.add_argument("--with", dest="folders", **SEVERAL, metavar="RESULTS", help=text)
     text = (
-        "also copy pages of avatars (captures/ID/avatar.html in these folders) and lead to "
+        "also copy pages of avatars (captures/ID/avatar.html in these folders) and link to "
         "them; they run the scripts of whoever made them"
     )
-    build.add_argument("--avatar-pages", action="store_true", help=text)
+    parser.add_argument("--avatar-pages", action="store_true", help=text)
 
 
 def _add_submit(parser: argparse.ArgumentParser) -> None:
+    _add_results(parser)
     add = parser.add_argument
-    add("-o", "--out", required=True, metavar="FOLDER", help="new folder of the submission")
-    add("--by", default="", metavar="NAME", help="who stands for the rows")
+    add_out(parser, "new folder of the submission")
+    add("--author", default="", metavar="NAME", help="who answers for the rows")
     text = "https address of code, paper, predictions or avatars; may be repeated"
     add("--link", action="append", default=[], metavar="KIND=URL", help=text)
     text = "fitted avatars, one file or folder for each capture id; only digests are noted"
@@ -170,22 +153,15 @@ def _add_submit(parser: argparse.ArgumentParser) -> None:
 def _add_confirm(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("results", metavar="RESULTS", help="results folder with predictions")
-    add("--by", required=True, metavar="NAME", help="who checks")
+    add("--checked-by", required=True, metavar="NAME", help="who checks")
     add("--entry", metavar="NAME", help="entry, where several fit")
     text = "largest difference of the macro mean of PSNR of a second run (default 0.1)"
     add("--tolerance", type=float, default=0.1, metavar="DB", help=text)
-    add("--captures", **SEVERAL, metavar="DIR", help="captures (default: the result's suite)")
+    add("--capture", **SEVERAL, metavar="PATH", help="captures (default: the result's suite)")
     text = "digest (8 digits at least) of a check of the entry that no longer counts"
     add("--overrules", action="append", default=[], metavar="CHECK", help=text)
     add("--reason", default="", metavar="TEXT", help="why it does not count")
     add_json(parser, "print the check as JSON")
-
-
-def run(args: argparse.Namespace) -> int:
-    """Run the command."""
-    folder = Path(args.entries) if args.entries else data_folder("leaderboard") / "entries"
-    status: int = args.act(args, folder)
-    return status
 
 
 def _add(args: argparse.Namespace, folder: Path) -> int:
@@ -226,7 +202,11 @@ def _submit(args: argparse.Namespace, folder: Path) -> int:
 def _submission(args: argparse.Namespace) -> Submission:
     from hwp_bench.leaderboard.entries import Submission
 
-    given = [("--by", args.by), ("--reason", args.reason), ("--revises", args.revises or "")]
+    given = [
+        ("--author", args.author),
+        ("--reason", args.reason),
+        ("--revises", args.revises or ""),
+    ]
     for option, text in [*given, *(("--link", text) for text in args.link)]:
         _check_line(option, text)
     links = {}
@@ -235,7 +215,7 @@ def _submission(args: argparse.Namespace) -> Submission:
         if not equals:
             raise UsageError(f"{text!r} is not KIND=URL", field="--link")
         links[kind] = address
-    return Submission(args.by, args.revises, args.reason, links)
+    return Submission(args.author, args.revises, args.reason, links)
 
 
 def _check_line(option: str, text: str) -> None:
@@ -295,7 +275,7 @@ def _confirm(args: argparse.Namespace, folder: Path) -> int:
     from hwp_bench.leaderboard.submit import confirm, entry_of
     from hwp_bench.results import read_results, result_files
 
-    _check_line("--by", args.by)
+    _check_line("--checked-by", args.checked_by)
     refuse_installed(folder)
     _refuse_none(folder)
     (file,) = result_files(args.results)
@@ -307,8 +287,8 @@ def _confirm(args: argparse.Namespace, folder: Path) -> int:
     check = confirm(
         entry,
         file,
-        captures_of(args.captures, file),
-        by=args.by,
+        captures_of(args.capture, file),
+        by=args.checked_by,
         tolerance=args.tolerance,
         overrules=args.overrules,
         reason=args.reason,
@@ -330,7 +310,7 @@ def _contest(args: argparse.Namespace, folder: Path) -> int:
     from hwp_bench.leaderboard.submit import contest
     from hwp_bench.results import result_files
 
-    _check_line("--by", args.by)
+    _check_line("--checked-by", args.checked_by)
     _check_line("--reason", args.reason)
     refuse_installed(folder)
     _refuse_none(folder)
@@ -341,7 +321,9 @@ def _contest(args: argparse.Namespace, folder: Path) -> int:
     if not args.withdraw:
         (rerun,) = result_files(args.rerun)
         check_source(rerun)
-    made = contest(fitting[0], rerun, by=args.by, reason=args.reason, withdraws=args.withdraw)
+    made = contest(
+        fitting[0], rerun, by=args.checked_by, reason=args.reason, withdraws=args.withdraw
+    )
     notice(f"{made.kind}: {write_check(folder, made)}")
     if made.results:
         own, other = (run.scores["psnr"] for run in (fitting[0].results, made.results))
@@ -431,3 +413,35 @@ def _print_entries(entries: Sequence[Entry], as_json: bool) -> None:
         for entry in entries
     ]
     print_json(facts)
+
+
+def _command(
+    examples: str,
+    add_arguments: Callable[[argparse.ArgumentParser], None],
+    act: Callable[[argparse.Namespace, Path], int],
+) -> tuple[Callable[[argparse.ArgumentParser], None], Callable[[argparse.Namespace], int]]:
+    """Return the arguments and the work of a command on a folder of entries, `--entries`."""
+
+    def add(parser: argparse.ArgumentParser) -> None:
+        parser.epilog = examples
+        add_arguments(parser)
+        text = "folder of the entries (default leaderboard/entries)"
+        parser.add_argument("--entries", type=Path, metavar="DIR", help=text)
+
+    def run(args: argparse.Namespace) -> int:
+        return act(args, args.entries or data_folder("leaderboard") / "entries")
+
+    return add, run
+
+
+#: The arguments and the work of each command, where `main` looks for them.
+COMMANDS = {
+    "show": _command(_SHOW, _add_show, _show),
+    "submit": _command(_SUBMIT, _add_submit, _submit),
+    "check": _command(_CHECK, _add_check, _check),
+    "confirm": _command(_CONFIRM, _add_confirm, _confirm),
+    "build": _command(_BUILD, _add_build, _build),
+    "add": _command(_ADD, _add_results, _add),
+    "contest": _command(_CONTEST, _add_contest, _contest),
+    "register": _command(_REGISTER, _add_register, _register),
+}

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 import tomllib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hwp_bench.base.console import notice
 from hwp_bench.base.errors import UsageError, has_odd_characters, shown
 from hwp_bench.base.records import parse_toml
 from hwp_bench.base.tables import Cell, Column, Table
@@ -42,6 +44,11 @@ def print_result(as_json: bool, value: Any, lines: Iterable[str]) -> int:
     return 0
 
 
+def say_next(*words: object) -> None:
+    """Say on standard error which command a person gives next."""
+    notice(f"next: {shlex.join(map(str, words))}")
+
+
 def named_table(caption: str, titles: str, rows: Iterable[Sequence[Cell]]) -> Table:
     """Return a table that ranks nothing; the titles of its columns are divided by commas."""
     columns = tuple(Column(title) for title in titles.split(", "))
@@ -59,9 +66,9 @@ def add_results(parser: argparse.ArgumentParser, nargs: str = "+", more: str = "
 
 
 def add_capture_folders(parser: argparse.ArgumentParser, purpose: str) -> None:
-    """Add `--captures`, for what results do not say of their captures."""
+    """Add `--capture`, for what results do not say of their captures."""
     text = f"capture folders, for {purpose} (simulated ones are found in the cache)"
-    parser.add_argument("--captures", **SEVERAL, metavar="FOLDER", help=text)
+    parser.add_argument("--capture", **SEVERAL, metavar="PATH", help=text)
 
 
 def add_suite_or_captures(parser: argparse.ArgumentParser) -> None:
@@ -83,9 +90,9 @@ def add_splits(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--splits", help="split file (default: the 80/10/10 rule)")
 
 
-def add_force(parser: argparse.ArgumentParser) -> None:
-    """Add `--force`, with which a command replaces a capture."""
-    parser.add_argument("--force", action="store_true", help="replace an existing capture")
+def add_overwrite(parser: argparse.ArgumentParser, what: str) -> None:
+    """Add `--overwrite`, with which a command replaces what is there."""
+    parser.add_argument("--overwrite", action="store_true", help=f"replace {what}")
 
 
 def splits_of(args: argparse.Namespace) -> Mapping[str, Split] | None:
@@ -104,7 +111,7 @@ def captures_of(places: Sequence[str] | None, file: Path) -> list[Path]:
     if places:
         folders = capture_folders([Path(place) for place in places])
         if not folders:
-            raise UsageError("there is no capture", field="--captures")
+            raise UsageError("there is no capture", field="--capture")
         return folders
     suite = read_results(file).suite
     if suite not in SUITES:
@@ -112,36 +119,9 @@ def captures_of(places: Sequence[str] | None, file: Path) -> list[Path]:
             f"was not made on a suite ({suite})",
             where=file,
             field="suite",
-            remedy="Say where its captures lie with --captures.",
+            remedy="Say where its captures lie with --capture.",
         )
     return ensure_suite(suite)
-
-
-def add_actions(
-    parser: argparse.ArgumentParser,
-) -> Callable[..., argparse.ArgumentParser]:
-    """Let a command have actions; returns what adds one: `action(name, text, act, epilog)`.
-
-    `args.action` is the name, and `args.act` the function of the one that is chosen.
-    """
-    actions = parser.add_subparsers(
-        dest="action", required=True, metavar="ACTION", help="what to do"
-    )
-
-    def action(
-        name: str, text: str, act: Callable[..., int] | None = None, epilog: str | None = None
-    ) -> argparse.ArgumentParser:
-        added = actions.add_parser(
-            name,
-            help=text,
-            description=f"{text[0].upper()}{text[1:]}.",
-            epilog=epilog,
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
-        added.set_defaults(act=act)
-        return added
-
-    return action
 
 
 def overrides(texts: Iterable[str]) -> dict[str, Any]:

@@ -12,7 +12,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
@@ -37,6 +37,8 @@ class Command:
     module: str = ""
     #: Commands of a group, by name.
     commands: dict[str, Command] = field(default_factory=dict)
+    #: Headings of a program's help, each with the commands below it, such as `data get`.
+    parts: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
     def load(self) -> tuple[AddArguments, Run]:
         """Import what adds the arguments of the command, and what runs it."""
@@ -153,21 +155,34 @@ def _describe_leaf(program: str, command: Command) -> dict[str, Any]:
 
 def _describe_group(program: str, group: Command) -> dict[str, Any]:
     """Return the keyword arguments of the parser of a group of commands."""
-    width = max(len(name) for name in group.commands)
-    lines = [f"  {name:<{width}}  {item.summary}" for name, item in group.commands.items()]
+    parts = group.parts or {"commands": tuple(group.commands)}
+    width = max(len(name) for names in parts.values() for name in names)
+    blocks = [f"{group.summary[0].upper()}{group.summary[1:]}."]
+    for heading, names in parts.items():
+        lines = [f"  {name:<{width}}  {_find(group, name).summary}" for name in names]
+        blocks.append("\n".join([f"{heading}:", *lines]))
     return {
         "prog": program,
-        "usage": f"{program} [-h] COMMAND ...",
-        "description": f"{group.summary[0].upper()}{group.summary[1:]}.\n\ncommands:\n"
-        + "\n".join(lines),
+        "usage": f"{program} [-h] [--version] COMMAND ...",
+        "description": "\n\n".join(blocks),
         "epilog": f"`{program} COMMAND --help` explains a command, with examples.",
         "formatter_class": argparse.RawDescriptionHelpFormatter,
     }
 
 
+def _find(group: Command, path: str) -> Command:
+    """Return the command of a path such as `data get`."""
+    for name in path.split():
+        group = group.commands[name]
+    return group
+
+
 def _group_parser(program: str, group: Command) -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(**_describe_group(program, group))
-    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    parser = argparse.ArgumentParser(**_describe_group(program, group), add_help=False)
+    # The usage names both; a list of them would take six lines of the screen.
+    parser.add_argument("-h", "--help", action="help", help=argparse.SUPPRESS)
+    version, text = f"%(prog)s {__version__}", argparse.SUPPRESS
+    parser.add_argument("--version", action="version", version=version, help=text)
     return parser
 
 

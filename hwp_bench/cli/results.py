@@ -1,4 +1,4 @@
-"""Commands about results: `table`, `compare`, `cost`, `report` and `verify`."""
+"""Commands about results: `table`, `compare`, `curves`, `report` and `verify`."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from hwp_bench.cli.options import (
     captures_of,
     named_table,
     print_json,
+    say_next,
     splits_of,
 )
 
@@ -37,7 +38,7 @@ _TABLE = """examples:
   hwp-bench table runs/* --by rank       # ranks with intervals; who is tied with whom
   hwp-bench table runs/* --by cost       # score, seconds, memory, seconds on one core
   hwp-bench table runs/* --by overall --format tex > table.tex
-  hwp-bench table runs/mine-mini runs/mine-mini-clean runs/plain-mini --by robustness --base plain
+  hwp-bench table runs/mine runs/mine-clean runs/plain-mini --by robustness --baseline plain
   hwp-bench table runs/mine-seed* --by seeds
   hwp-bench table runs/* --by discrimination    # which captures and metrics tell methods apart
   hwp-bench table runs/mine-persistent* runs/plain-persistent* --by clean-share --figure runs
@@ -66,7 +67,7 @@ def _add_table(parser: argparse.ArgumentParser) -> None:
     )
     add("--published", action="store_true", help=text)
     add(
-        "--base",
+        "--baseline",
         metavar="NAME",
         help="robustness: method that the gap is counted from; discrimination: the ceiling",
     )
@@ -83,7 +84,7 @@ def _table(args: argparse.Namespace) -> int:
     from hwp_bench.report.requested_table import TableRequest, make_table
 
     request = TableRequest(
-        args.results, args.by, args.paper, args.published, args.base, args.captures
+        args.results, args.by, args.paper, args.published, args.baseline, args.capture
     )
     _print_table(make_table(request), "json" if args.json else args.format)
     if args.figure is not None:
@@ -95,7 +96,7 @@ def _table(args: argparse.Namespace) -> int:
         from hwp_bench.results import read_all
 
         results = read_all([Path(place) for place in args.results])
-        for path in write_clean_share(args.figure, results, find_captures(results, args.captures)):
+        for path in write_clean_share(args.figure, results, find_captures(results, args.capture)):
             print(path)
     return 0
 
@@ -154,11 +155,11 @@ def _compare(args: argparse.Namespace) -> int:
     return 0
 
 
-_COST = """examples:
-  hwp-bench cost runs/plain-mini runs/mine-mini
-  hwp-bench cost runs/mine-mini --reference runs/plain-mini -o runs/cost
-  hwp-bench cost runs/ablation --metric oriented_distance     # every variant of an ablation
-  hwp-bench cost runs/* --budgets 10 30 120 --json
+_CURVES = """examples:
+  hwp-bench curves runs/plain-mini runs/mine-mini
+  hwp-bench curves runs/mine-mini --reference runs/plain-mini -o runs/curves
+  hwp-bench curves runs/ablation --metric oriented_distance     # every variant of an ablation
+  hwp-bench curves runs/* --budgets 10 30 120 --json
 
 Prints scores after fixed times, times to given scores, where the time goes, and which method has
 the best score when; writes the tables and the figure of score against seconds (PNG and SVG) to the
@@ -167,8 +168,8 @@ output folder. Results on different data are analysed apart: their tables say `D
 """
 
 
-def _add_cost(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = _COST
+def _add_curves(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = _CURVES
     add_results(parser, more="; seeds of a method go together")
     add = parser.add_argument
     text = "result whose final score is a target (default: the plain baseline, if it is there)"
@@ -177,11 +178,11 @@ def _add_cost(parser: argparse.ArgumentParser) -> None:
     times, text = [5.0, 15.0, 60.0, 300.0], "times at which scores are read"
     text += " (default 5 15 60 300, those that are reached)"
     add("--budgets", nargs="+", type=float, default=times, metavar="SECONDS", help=text)
-    add("-o", "--out", default="hwp-cost", help="folder to write (default hwp-cost)")
+    add("-o", "--out", default="hwp-curves", help="folder to write (default hwp-curves)")
     add_json(parser, "print JSON with the curves")
 
 
-def _cost(args: argparse.Namespace) -> int:
+def _curves(args: argparse.Namespace) -> int:
     from hwp_bench.analysis.cost import CostAnalysis, analyse_cost
     from hwp_bench.analysis.pairing import group_runs
     from hwp_bench.metrics import metric
@@ -239,10 +240,10 @@ def _cost(args: argparse.Namespace) -> int:
 _REPORT = """examples:
   hwp-bench report runs/plain-mini -o reports/plain
   hwp-bench report runs/mine-mini runs/plain-mini -o reports/mine
-  hwp-bench report runs/mine-mini runs/mine-mini-clean runs/plain-mini --base plain -o reports/mine
+  hwp-bench report runs/mine runs/mine-clean runs/plain-mini --baseline plain -o reports/mine
   hwp-bench report runs/* -o reports/all
   hwp-bench report runs/wildghand-mini --avatar-pages -o reports/wildghand
-  hwp-bench report runs/mine-captures --captures my_captures/* -o reports/mine
+  hwp-bench report runs/mine-captures --capture my_captures/* -o reports/mine
 
 Results on different data get a page each, A/index.html, B/index.html, ..., and index.html leads to
 them.
@@ -258,7 +259,7 @@ def _add_report(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("-o", "--out", required=True, metavar="DIR", help="folder of the page")
     add_capture_folders(parser, "severities")
-    add("--base", metavar="NAME", help="method that shares of the gap are counted from")
+    add("--baseline", metavar="NAME", help="method that shares of the gap are counted from")
     text = (
         "lead to pages of avatars (captures/ID/avatar.html in a results folder); they run "
         "the scripts of whoever made them"
@@ -272,13 +273,13 @@ def _report(args: argparse.Namespace) -> int:
     from hwp_bench.report.sources import read_sources, source_folders
 
     sources = read_sources(args.results, repeats=False)
-    inputs = {"RESULTS": source_folders(sources), "--captures": args.captures}
+    inputs = {"RESULTS": source_folders(sources), "--capture": args.capture}
     check_places({"--out": args.out}, inputs)
     pages = write_reports(
         Path(args.out),
         sources,
-        args.captures,
-        base=args.base,
+        args.capture,
+        base=args.baseline,
         title=args.title,
         avatar_pages=args.avatar_pages,
     )
@@ -289,7 +290,7 @@ def _report(args: argparse.Namespace) -> int:
 
 _VERIFY = """examples:
   hwp-bench verify runs/plain-mini
-  hwp-bench verify runs/mine --captures my_captures
+  hwp-bench verify runs/mine --capture my_captures
   hwp-bench verify runs/ablation --json          # every result of an ablation
 
 Recomputes the digests of captures, splits and predictions, and every score, from the predictions
@@ -304,7 +305,7 @@ def _add_verify(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _VERIFY
     add_results(parser)
     text = "captures, or folders of captures (default: the result's suite)"
-    parser.add_argument("--captures", **SEVERAL, metavar="DIR", help=text)
+    parser.add_argument("--capture", **SEVERAL, metavar="PATH", help=text)
     add_splits(parser)
     add_json(parser)
 
@@ -316,14 +317,17 @@ def _verify(args: argparse.Namespace) -> int:
     splits = splits_of(args)
     files = [file for path in args.results for file in result_files(path)]
     outcomes = [
-        verify_results(file, captures_of(args.captures, file), splits)
+        verify_results(file, captures_of(args.capture, file), splits)
         for file in track(files, "verify")
     ]
     if args.json:
         print_json([asdict(outcome) for outcome in outcomes])
     for outcome in () if args.json else outcomes:
         _print_verify(outcome)
-    return 1 if any(outcome.discrepancies for outcome in outcomes) else 0
+    status = 1 if any(outcome.discrepancies for outcome in outcomes) else 0
+    if status == 0:
+        say_next("hwp-bench", "leaderboard", "submit", *args.results, "-o", "submission")
+    return status
 
 
 def _print_verify(outcome: Verification) -> None:
@@ -346,7 +350,7 @@ def _print_verify(outcome: Verification) -> None:
 COMMANDS = {
     "table": (_add_table, _table),
     "compare": (_add_compare, _compare),
-    "cost": (_add_cost, _cost),
+    "curves": (_add_curves, _curves),
     "report": (_add_report, _report),
     "verify": (_add_verify, _verify),
 }

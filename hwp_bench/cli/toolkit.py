@@ -19,14 +19,15 @@ if TYPE_CHECKING:
 _LIST = """examples:
   hwp-bench list
   hwp-bench list metrics
+  hwp-bench list scenes
   hwp-bench list captures --json
 """
 
 
 def _add_list(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _LIST
-    text = "what to list (default: everything)"
-    parser.add_argument("topic", nargs="?", choices=tuple(_TOPICS), help=text)
+    text = f"what to list (default: everything): {', '.join(_TOPICS)}"
+    parser.add_argument("topic", nargs="?", choices=tuple(_TOPICS), metavar="TOPIC", help=text)
     add_json(parser)
 
 
@@ -114,18 +115,51 @@ def _metrics() -> Table:
     return named_table("Metrics", "metric, protocol, unit, better, penalty, what it measures", rows)
 
 
+def _scenes() -> Table:
+    from hwp_bench.sim.scene_files import known_scenes, load_scene
+
+    rows = [
+        (
+            *(scene.id, scene.title, scene.hands, scene.action, scene.device, scene.frame_count),
+            ", ".join(call.kind for call in scene.effects),
+            scene.digest,
+        )
+        for scene in map(load_scene, known_scenes())
+    ]
+    titles = "scene, title, hands, action, device, frames, effects, digest"
+    return named_table("Scenes of the simulator", titles, rows)
+
+
+def _parts() -> Table:
+    from hwp_bench.hands.poses import gestures
+    from hwp_bench.sim.effects import ORDER
+    from hwp_bench.sim.props.behind import backdrop_names
+    from hwp_bench.sim.props.objects import object_names
+
+    parts = {
+        "effects": ORDER,
+        "objects": object_names(),
+        "gestures": gestures(),
+        "backgrounds": backdrop_names(),
+    }
+    rows = [(part, ", ".join(names)) for part, names in parts.items()]
+    return named_table("What scene files can name", "part, names", rows)
+
+
 _TOPICS = {
     "captures": _captures,
     "perturbations": _perturbations,
     "suites": _suites,
     "methods": _methods,
     "metrics": _metrics,
+    "scenes": _scenes,
+    "scene-parts": _parts,
 }
 
 _STABILITY = """examples:
-  hwp-bench stability
-  hwp-bench stability --group splat --backend numba
-  hwp-bench stability --json > stability.json
+  hwp-bench dev stability
+  hwp-bench dev stability --group splat --backend numba
+  hwp-bench dev stability --json > stability.json
 """
 
 

@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-import json
 import os
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import atomic_folder, atomic_write, refuse_existing
+from hwp_bench.base.packages import data_folder
 from hwp_bench.capture import Capture
 from hwp_bench.capture.splits import Split
 from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.manifest import MANIFEST as METHOD_MANIFEST
-from hwp_bench.methods.manifest import SCHEMA as METHOD_SCHEMA
 from hwp_bench.methods.request import write_request
+from hwp_bench.methods.template import check_name, fill_template
 
 #: Folders inside the inputs, and the page that explains them.
 REQUESTS, SUBMISSION, PREDICTIONS, README = "requests", "submission", "predictions", "README.md"
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
 @dataclass(frozen=True)
@@ -48,7 +45,8 @@ def write_inputs(
         for capture, split in captures:
             write_request(root / REQUESTS / capture.info.id, capture, split, RunSettings({}))
             (root / SUBMISSION / PREDICTIONS / capture.info.id).mkdir(parents=True)
-        atomic_write(root / SUBMISSION / METHOD_MANIFEST, _manifest(name))
+        manifest = data_folder("templates") / "predictions" / METHOD_MANIFEST
+        atomic_write(root / SUBMISSION / METHOD_MANIFEST, fill_template(manifest, name))
         atomic_write(root / README, _readme(captures, score))
     folder = Path(out)
     wanted = {capture.info.id: len(split.test) for capture, split in captures}
@@ -58,26 +56,7 @@ def write_inputs(
 def check_place(out: str | os.PathLike[str], name: str) -> None:
     """Refuse what `write_inputs` would refuse, before captures are rendered for it."""
     refuse_existing(out)
-    check_name(name)
-
-
-def check_name(name: str) -> None:
-    """Refuse a `--name` that a method cannot have."""
-    if not _NAME.fullmatch(name):
-        raise UsageError(
-            f"{name[:100]!r} is not a name of letters, digits and . _ -", field="--name"
-        )
-
-
-def _manifest(name: str) -> str:
-    text = json.dumps(name)
-    return (
-        f'schema = "{METHOD_SCHEMA}"\nname = {text}\ntitle = {text}\ndescription = ""\n'
-        "# What the program was trained on before it saw a capture: if anything, a table\n"
-        "# [training] with `simulated`, `public` or `private` (docs/methods.md).\n"
-        'training = "none"\n\n'
-        f'[entry]\npredictions = "{PREDICTIONS}"\n'
-    )
+    check_name(name, "--name")
 
 
 def _readme(captures: Sequence[tuple[Capture, Split]], score: str) -> str:

@@ -118,7 +118,7 @@ class SealedRecipe:
             raise UsageError(
                 f"{unknown[0]!r} is not a scene that comes with the toolkit",
                 field="scenes",
-                remedy="Those who check a suite must have its scenes: `hwp-bench sim list`.",
+                remedy="Those who check a suite must have its scenes: `hwp-bench list scenes`.",
             )
 
     def refuse_other_toolkit(self) -> None:
@@ -138,7 +138,7 @@ class SealedRecipe:
 def recipe_of(names: Sequence[str], frames: int, size: int) -> SealedRecipe:
     """Make a recipe of scenes that come with the package."""
     if not 10 <= frames <= 100_000:
-        raise UsageError(f"{frames} is not from 10 to 100000", field="--frames")
+        raise UsageError(f"{frames} is not from 10 to 100000", field="--frame-count")
     if not 16 <= size <= 4096:
         raise UsageError(f"{size} is not from 16 to 4096", field="--size")
     if not 1 <= len(names) <= MAX_CAPTURES:

@@ -80,7 +80,7 @@ def read_suite_page(public: str | os.PathLike[str]) -> SuitePage:
         raise BadInput(
             f"holds no {SUITE}",
             where=public,
-            remedy="Give the folder public of a suite that `hwp-bench sealed make` made.",
+            remedy="Give the folder public of a suite that `hwp-bench challenge make` made.",
         )
     return read_strictly(path, SUITE_SCHEMA, SuitePage)
 

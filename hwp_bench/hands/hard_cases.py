@@ -1,4 +1,4 @@
-"""Hard cases of posing and projection, for `hwp-bench stability` and for the tests.
+"""Hard cases of posing and projection, for `hwp-bench dev stability` and for the tests.
 
 Each compares with what must be the same by symmetry or arithmetic: the pose without its whole
 turns, float64, another memory layout, one frame at a time, the mirrored hand.

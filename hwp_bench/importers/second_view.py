@@ -114,7 +114,7 @@ def add_second_view(
         UsageError: there is a clip, or the captures do not go together.
         BadInput: what the cameras saw contradicts the calibration.
     """
-    refuse_existing(first.root / FREE_VIEW, overwrite=overwrite, flag="--force")
+    refuse_existing(first.root / FREE_VIEW, overwrite=overwrite, flag="--overwrite")
     for name in ("hands", "width", "height"):
         values = [getattr(capture.info, name) for capture in (first, second)]
         if values[0] != values[1]:
@@ -208,7 +208,7 @@ def _common_frames(first: Capture, second: Capture, offset: int) -> tuple[np.nda
         raise UsageError(
             f"has no frame at the time of one of {first.root} in which both have every hand",
             where=second.root,
-            remedy="Import both with frames of the same times: --frames, --stride, the offset.",
+            remedy="Import both with frames of the same times: --range, --stride, the offset.",
         )
     rows, others = np.array(pairs)[evenly(len(pairs), MOST)].T
     return rows, others
@@ -234,7 +234,7 @@ def _cropped(capture: Capture, rows: np.ndarray, K: list[list[float]]) -> np.nda
             "does not say how its frames were cropped from a video",
             where=capture.root,
             field="source.crop",
-            remedy="A calibration is for captures of `hwp-bench data import-video`.",
+            remedy="A calibration is for captures of `hwp-bench data import video`.",
         ) from error
 
 

@@ -481,7 +481,7 @@ def _read_contest(file: Path) -> Contest:
     content = parse_record(_ContestFile, value, where=file)
     given = value["contest"]
     if content.digest != sha256_json(given):
-        raise _changed(file, "contest", "Contest again with `hwp-bench leaderboard contest`.")
+        raise _changed(file, "contest", "Contest again with `hwp-bench dev leaderboard contest`.")
     if given.get("results") is not None and sha256_json(given["results"]) != given["rerun"]:
         raise BadResult("is not the digest of its results", where=file, field="contest.rerun")
     return content.contest

@@ -324,7 +324,7 @@ def check_names(entries: Iterable[Entry], listed: frozenset[str]) -> None:
                 where=entry.name,
                 field="method.name",
                 remedy="Give the method a name and title of its own in its method.toml. Rows of "
-                "methods that ship come from the maintainers (`hwp-bench leaderboard register`).",
+                "methods that ship come from maintainers (`hwp-bench dev leaderboard register`).",
             )
 
 

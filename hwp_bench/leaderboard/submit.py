@@ -175,7 +175,7 @@ def pull_request_text(made: Iterable[tuple[Entry, int]]) -> str:
         "",
         "```sh",
         f"hwp-bench leaderboard check --entries {PLACE} --against BASE/{PLACE}",
-        f"hwp-bench leaderboard confirm RESULTS --entries {PLACE} --by NAME",
+        f"hwp-bench leaderboard confirm RESULTS --entries {PLACE} --checked-by NAME",
         "```",
     ]
     return "\n".join(lines) + "\n"

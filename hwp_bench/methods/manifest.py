@@ -43,10 +43,9 @@ def _matching(pattern: str, description: str) -> Meta:
     return Meta(pattern=rf"\A(?:{pattern})\Z", description=description)
 
 
-_MethodName = Annotated[
-    str,
-    _matching(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}", "a name of letters, digits and . _ -"),
-]
+#: Pattern of a method's name.
+METHOD_NAME = r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}"
+_MethodName = Annotated[str, _matching(METHOD_NAME, "a name of letters, digits and . _ -")]
 _PythonEntry = Annotated[str, _matching(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*", "module:callable")]
 _Words = Annotated[list[str], Meta(min_length=1, description="a list of words")]
 _SwitchName = Annotated[

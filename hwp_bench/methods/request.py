@@ -186,7 +186,7 @@ def choose_training_inputs(capture: Capture, split: Split, choice: str) -> Train
         raise UsageError(
             "does not know its clean frames",
             where=capture.root,
-            remedy="Only simulated captures do; use --frames perturbed.",
+            remedy="Only simulated captures do; use --train-on perturbed.",
         )
     repaired = {side: _replaced(hand, truth[side], perturbed) for side, hand in hands.items()}
     return TrainingInputs(split.train, "clean", "clean_masks", repaired)
@@ -241,7 +241,7 @@ def _perturbed(capture: Capture) -> np.ndarray:
             raise UsageError(
                 f"does not know in which frames {name} acts",
                 where=capture.root,
-                remedy="Use --frames perturbed.",
+                remedy="Use --train-on perturbed.",
             )
         acts |= np.array(severities) > 0
     return acts

@@ -1,4 +1,4 @@
-"""Hard cases of scoring, for `hwp-bench stability` and for the tests.
+"""Hard cases of scoring, for `hwp-bench dev stability` and for the tests.
 
 Each compares with an independent form: float64 sums over the scored pixels, or scikit-image's SSIM.
 """

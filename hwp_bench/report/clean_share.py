@@ -105,7 +105,7 @@ def scores_by_share(
     if not curves:
         raise UsageError(
             "the share of clean training frames of none of these captures is known",
-            field="--captures",
+            field="--capture",
             remedy="Name the capture folders, or render the suite on this machine.",
         )
     titles = dict(zip(firsts, labels([*firsts.values()]), strict=True))

@@ -206,7 +206,7 @@ def novelty_table(sources: Sequence[ResultsSource], captures: Mapping[str, Captu
     if not any(pixels.any() for pixels, _ in totals):
         raise UsageError(
             "none of these captures, or none of the predictions, is at hand",
-            field="--captures",
+            field="--capture",
             remedy="Name the capture folders, and results folders that hold predictions.",
         )
     half = len(_ANGLE_NAMES) + 1
@@ -317,7 +317,7 @@ def outline_table(sources: Sequence[ResultsSource], captures: Mapping[str, Captu
     if not found or not found[0]:
         raise UsageError(
             "none of these captures is at hand with the predictions of every method",
-            field="--captures",
+            field="--capture",
             remedy="Name the capture folders, and results folders that hold predictions.",
         )
     means = [_mean(scores) for scores in found]

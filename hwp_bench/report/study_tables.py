@@ -134,7 +134,7 @@ def robustness_table(sources: Sequence[ResultsSource], base: str | None = None) 
         raise UsageError(
             "no method was evaluated on perturbed and on clean frames",
             field="RESULTS",
-            remedy="Give the results of `evaluate` and of `evaluate --frames clean`.",
+            remedy="Give the results of `evaluate` and of `evaluate --train-on clean`.",
         )
     start = _base(perturbed, base)
     names = common_metrics(runs, ROBUST)
@@ -214,7 +214,7 @@ def severity_table(sources: Sequence[ResultsSource], captures: Mapping[str, Capt
     if not cells:
         raise UsageError(
             "the severity of none of these captures is known",
-            field="--captures",
+            field="--capture",
             remedy="Name the capture folders, or render the suite on this machine.",
         )
     titles = labels(results)

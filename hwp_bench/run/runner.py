@@ -94,8 +94,9 @@ def run_method(
     time_limit: float = DEFAULT_TIME_LIMIT,
     confinement: Confinement | None = None,
     on_progress: Callable[[int, int], None] | None = None,
+    check: bool = False,
 ) -> RunRecord:
-    """Run a method on a request."""
+    """Run a method on a request; a Python method that is checked leaves `findings.json`."""
     if manifest.kind == "predictions":
         below = f"{manifest.entry.predictions}/{capture_id}"
         folder, clip = inside(manifest.root, below), inside(manifest.root, f"{below}/{FREE_VIEW}")
@@ -114,7 +115,10 @@ def run_method(
     # In a sandbox the working folder is another one, and a relative path would lead nowhere.
     folders = request.absolute(), output.absolute()
     space = SpaceWatch(folders[1])
-    outcome, isolation = _run(manifest, *folders, confinement, limits, on_progress, space=space)
+    options = ("--check",) if check and manifest.kind == "python" else ()
+    outcome, isolation = _run(
+        manifest, *folders, confinement, limits, on_progress, options, space=space
+    )
     wall = time.perf_counter() - started
     # First the links, pipes, sockets and devices. A link that leads nowhere inside a sandbox leads
     # to real files outside it: the toolkit would read a test frame for a prediction. A method may
@@ -175,7 +179,7 @@ def rehearse_method(
         write_json(request / REHEARSAL, asked)
         outcome, _ = _run(manifest, request, output, confinement, limits, None, ("--rehearse",))
         if outcome.status != 0:
-            lines = _last_lines(output / LOG)
+            lines = last_lines(output / LOG)
             # One line is the reason itself.
             for line in lines if len(lines) > 1 else ():
                 notice(f"{manifest.name}: {line}")
@@ -267,7 +271,7 @@ def _broken(limit: str, when: str, limits: Limits) -> str:
 def _reason(output: Path, status: int | None) -> str:
     with contextlib.suppress(BadInput, KeyError, TypeError):
         return shown(str(read_json(output / FAILURE, max_bytes=100_000)["problem"])[:2000])
-    last = _last_lines(output / LOG)[-1:]
+    last = last_lines(output / LOG)[-1:]
     if status is not None and status > 0 and last:
         return f"exit status {status}; it printed last: {last[0]}"
     if status is not None and status < 0:
@@ -276,7 +280,7 @@ def _reason(output: Path, status: int | None) -> str:
     return f"exit status {status}"
 
 
-def _last_lines(log: Path) -> list[str]:
+def last_lines(log: Path) -> list[str]:
     """Return the last lines that a method printed, such as the end of its traceback."""
     try:
         with open(log, "rb") as stream:

@@ -1,7 +1,8 @@
 """The process that a Python method runs in, and what it leaves in its output folder.
 
-It is given a request folder and an output folder, and does not know where the capture is. It is
-started by `hwp_bench.run.start`. A command may write the same files.
+It is given a request folder and an output folder, and does not know where the capture is. With
+`--check` it draws on where a picture cannot be taken, and lists what is wrong. It is started by
+`hwp_bench.run.start`. A command may write the same files.
 """
 
 from __future__ import annotations
@@ -16,14 +17,14 @@ import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 from msgspec import Meta
 
 from hwp_bench.base.arrays import evenly
 from hwp_bench.base.console import notice
-from hwp_bench.base.errors import BadMethod, HwpError, MethodFailed, shown
+from hwp_bench.base.errors import BadMethod, HwpError, MethodFailed, one_line, shown
 from hwp_bench.base.files import read_json, write_json
 from hwp_bench.base.images import as_uint8, write_image
 from hwp_bench.base.records import Count, Line, Seconds, parse_record
@@ -48,11 +49,17 @@ PROGRESS = "progress.json"
 FAILURE = "failure.json"
 #: The method's printed output.
 LOG = "log.txt"
+#: What a run with `--check` found wrong.
+FINDINGS = "findings.json"
 #: Settings and seed of a method that is only made, in the place of a request.
 REHEARSAL = "rehearsal.json"
 #: Largest `run.json` that is read, bytes; most frames and checkpoints in it.
 MAX_BYTES = 1024 * 1024
 MAX_FRAMES, MAX_CHECKPOINTS = 64, 1000
+#: Most places of one finding that are named.
+MAX_PLACES = 5
+# Colours may leave [0, 1] by this much, as sums of weights do, before a check doubts them.
+_MARGIN = 0.02
 #: Most validation frames that are rendered for a checkpoint.
 CHECKPOINT_FRAMES = 8
 #: Seconds between two writes of the progress file.
@@ -67,16 +74,20 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--method", type=Path, required=True)
     parser.add_argument("--entry", required=True)
     parser.add_argument("--rehearse", action="store_true")
+    parser.add_argument("--check", action="store_true")
     args = parser.parse_args(arguments)
     args.output.mkdir(parents=True, exist_ok=True)
-    status = 1
+    status, watch = 1, Watch() if args.check else None
+    if watch is not None:
+        sys.addaudithook(watch.hear)
     try:
         factory = load_entry(args.method, args.entry)
         if args.rehearse:
             asked = read_json(args.request / REHEARSAL)
             factory(asked["settings"], asked["seed"])
         else:
-            run(open_request(args.request), factory, args.output)
+            draw = render_checked if watch is None else watch.draw
+            run(open_request(args.request), factory, args.output, draw)
         return 0
     except (HwpError, SystemExit) as error:
         if isinstance(error, SystemExit) and isinstance(error.code, int | None):
@@ -87,6 +98,9 @@ def main(arguments: list[str] | None = None) -> int:
         traceback.print_exc()
         problem = f"{type(error).__name__}: {error}"
         status = 130 if isinstance(error, KeyboardInterrupt) else 1
+    finally:
+        if watch is not None:
+            write_json(args.output / FINDINGS, [asdict(one) for one in watch.found.values()])
     # For the runner; a full disc takes the reason from nobody else.
     with contextlib.suppress(HwpError, ValueError):
         # A message may hold what no file of Unicode can.
@@ -110,15 +124,22 @@ def load_entry(method: Path, entry: str) -> MethodFactory:
     return factory
 
 
-def run(training: TrainingCapture, factory: MethodFactory, output: Path) -> None:
+#: Renders a picture of hands with a camera; the last argument is its name in messages.
+Draw: TypeAlias = Callable[[Avatar, Mapping[str, HandPose], Camera, str], np.ndarray]
+
+
+def run(training: TrainingCapture, factory: MethodFactory, output: Path, draw: Draw) -> None:
     """Fit, render the targets, and write predictions, checkpoints and `run.json`."""
     validation = training.validation
     frames = validation[evenly(len(validation), CHECKPOINT_FRAMES)].tolist()
 
+    def render(avatar: Avatar, frame: int) -> np.ndarray:
+        return draw(avatar, training.hand_poses(frame), training.camera(frame), f"frame {frame}")
+
     def record(index: int, avatar: Avatar) -> None:
         for frame in frames:
             folder = checkpoint_folder(output, index)
-            write_image(folder / frame_name(frame), render(avatar, training, frame))
+            write_image(folder / frame_name(frame), render(avatar, frame))
 
     entered = time.perf_counter()
     method = factory(training.run.settings, training.run.seed)
@@ -136,10 +157,10 @@ def run(training: TrainingCapture, factory: MethodFactory, output: Path) -> None
     render_seconds = 0.0
     for frame in training.targets.tolist():
         started = time.perf_counter()
-        pixels = render(avatar, training, frame)
+        pixels = render(avatar, frame)
         render_seconds += time.perf_counter() - started
         write_image(output / PREDICTIONS / frame_name(frame), pixels)
-    render_free_views(avatar, training, output / FREE_VIEW)
+    render_free_views(avatar, training, output / FREE_VIEW, draw)
     facts = RunFacts(
         fit_seconds=fit_seconds,
         cpu_seconds=cpu,
@@ -155,7 +176,7 @@ def run(training: TrainingCapture, factory: MethodFactory, output: Path) -> None
     write_json(output / RUN, asdict(facts))
 
 
-def render_free_views(avatar: Avatar, training: TrainingCapture, folder: Path) -> None:
+def render_free_views(avatar: Avatar, training: TrainingCapture, folder: Path, draw: Draw) -> None:
     """Render the free-view clip, if there is one; a frame that fails costs only itself."""
     views = training.free_views
     if views is None:
@@ -164,17 +185,11 @@ def render_free_views(avatar: Avatar, training: TrainingCapture, folder: Path) -
         hands = views.hand_poses(frame)
         camera = views.cameras.camera(frame, training.width, training.height)
         try:
-            pixels = render_checked(avatar, hands, camera, f"free-view frame {frame}")
+            pixels = draw(avatar, hands, camera, f"free-view frame {frame}")
         except Exception:
             traceback.print_exc()
             continue
         write_image(folder / frame_name(frame), pixels)
-
-
-def render(avatar: Avatar, training: TrainingCapture, frame: int) -> np.ndarray:
-    """Render one frame of the capture; see `render_checked`."""
-    hands, camera = training.hand_poses(frame), training.camera(frame)
-    return render_checked(avatar, hands, camera, f"frame {frame}")
 
 
 def render_checked(
@@ -185,16 +200,100 @@ def render_checked(
     A fourth channel is dropped: the data set owns the mask.
     """
     image = np.asarray(avatar.render(hands, camera))
+    fault = _fault(image, camera)
+    if fault is not None:
+        raise MethodFailed(fault[1], field=name)
+    return as_uint8(np.asarray(image[:, :, :3], dtype=np.float64))
+
+
+def _fault(image: np.ndarray, camera: Camera) -> tuple[str, str] | None:
+    """Why a picture cannot be taken: what is wrong in a word, and in a sentence."""
     size = (camera.height, camera.width)
     if image.shape not in ((*size, 3), (*size, 4)):
-        raise MethodFailed(
-            f"render returned shape {image.shape}, not {(*size, 3)} or {(*size, 4)}", field=name
-        )
+        return "shape", f"render returned shape {image.shape}, not {(*size, 3)} or {(*size, 4)}"
     if image.dtype.kind not in "fiub":
-        raise MethodFailed(f"render returned {image.dtype}, not real numbers", field=name)
+        return "type", f"render returned {image.dtype}, not real numbers"
     if not np.isfinite(image).all():
-        raise MethodFailed("render returned NaN or infinity", field=name)
-    return as_uint8(np.asarray(image[:, :, :3], dtype=np.float64))
+        return "nan", "render returned NaN or infinity"
+    return None
+
+
+# --- a run that is checked: it continues where a picture cannot be taken
+
+
+@dataclass
+class RunFinding:
+    """One kind of thing that a checked run found wrong."""
+
+    #: What is wrong in a word.
+    check: Line
+    #: The sentence of the first place.
+    problem: Line
+    #: How many places there are, and the first of them.
+    count: Count = 0
+    places: Annotated[list[Line], Meta(max_length=MAX_PLACES)] = field(default_factory=list)
+
+
+class Watch:
+    """Collects what is wrong with pictures, and looks for calls to the network."""
+
+    def __init__(self) -> None:
+        self.found: dict[str, RunFinding] = {}
+
+    def note(self, check: str, problem: str, place: str) -> None:
+        """Add a place to what is found."""
+        finding = self.found.setdefault(check, RunFinding(check, one_line(problem, 500)))
+        finding.count += 1
+        if len(finding.places) < MAX_PLACES:
+            finding.places.append(one_line(place, 200))
+
+    def hear(self, event: str, arguments: tuple[Any, ...]) -> None:
+        """Note an audit event of Python that asks for another machine."""
+        if event not in ("socket.connect", "socket.sendto", "socket.getaddrinfo"):
+            return
+        address = arguments[0] if event == "socket.getaddrinfo" else arguments[1]
+        host = address[0] if isinstance(address, tuple) else address
+        local = not host or (event != "socket.getaddrinfo" and not isinstance(address, tuple))
+        if local or str(host).startswith(("127.", "::1", "localhost")):
+            return
+        self.note("network", "the method asks for another machine", str(host))
+
+    def draw(
+        self, avatar: Avatar, hands: Mapping[str, HandPose], camera: Camera, name: str
+    ) -> np.ndarray:
+        """Render as `render_checked` does; a picture that cannot be taken is noted and black."""
+        try:
+            image = np.asarray(avatar.render(hands, camera))
+        except Exception as error:
+            traceback.print_exc()
+            self.note("run", f"render raised {type(error).__name__}: {error}", name)
+            return np.zeros((camera.height, camera.width, 3), np.uint8)
+        fault = _fault(image, camera)
+        if fault is not None:
+            self.note(*fault, name)
+            return np.zeros((camera.height, camera.width, 3), np.uint8)
+        colours = np.asarray(image[:, :, :3], dtype=np.float64)
+        low, high = colours.min(), colours.max()
+        if low < -_MARGIN or high > 1 + _MARGIN:
+            text = f"render returned colours from {low:.3g} to {high:.3g}, not in [0, 1]"
+            self.note("range", text, name)
+        return as_uint8(colours)
+
+
+def read_findings(path: Path) -> list[RunFinding]:
+    """Read what a checked run found; nothing where it was killed before, or ran unchecked."""
+    if not path.is_file():
+        return []
+    value = {"found": read_json(path, max_bytes=MAX_BYTES)}
+    listed = parse_record(_Findings, value, where=path)
+    return listed.found
+
+
+@dataclass(frozen=True)
+class _Findings:
+    """The content of the file."""
+
+    found: Annotated[list[RunFinding], Meta(max_length=MAX_FRAMES)]
 
 
 # --- the clock and its checkpoints

@@ -344,7 +344,7 @@ def track_video(
     if out.suffix != ".npz":
         raise UsageError("must end in .npz", where=out, field="-o")
     if out.exists() and not overwrite:
-        raise UsageError("exists already", where=out, remedy="Choose another name, or --force.")
+        raise UsageError("exists already", where=out, remedy="Choose another name, or --overwrite.")
     settings = settings or TrackerSettings()
     info = probe(video)
     if networks is None:
@@ -362,7 +362,7 @@ def track_video(
         raise NoHandSeen(
             f"none of {collected.frames} frames shows a hand ({shown} has some of them)",
             where=info.path,
-            remedy="The whole hand must be visible. Lower --min-confidence to accept less.",
+            remedy="The whole hand must be visible. Lower --min-score to accept less.",
         )
     tracked = TrackedVideo(info, hands, time.perf_counter() - began, endings[0])
     write_hand_tracks(out, hands)

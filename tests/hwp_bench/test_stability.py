@@ -72,18 +72,18 @@ def test_a_case_runs_on_each_backend_and_its_exception_is_a_failure() -> None:
 def test_command_prints_a_table_and_tells_by_its_exit_status(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    assert main(["stability", "--group", "alpha"]) == 0
+    assert main(["dev", "stability", "--group", "alpha"]) == 0
     out = capsys.readouterr().out
     assert "ran on cpu" in out
     assert "2 of 2 passed" in out
-    assert main(["stability"]) == 1
+    assert main(["dev", "stability"]) == 1
     captured = capsys.readouterr()
     assert "2 of 4 passed" in captured.out
     assert "failed: bad: error 3" in captured.err
 
 
 def test_command_prints_json(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["stability", "--json", "--backend", "cpu"]) == 0
+    assert main(["dev", "stability", "--json", "--backend", "cpu"]) == 0
     (row,) = json.loads(capsys.readouterr().out)
     assert row.pop("seconds") >= 0
     assert row == {
@@ -93,6 +93,6 @@ def test_command_prints_json(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_command_refuses_what_is_not_there(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["stability", "--backend", "tpu"]) == 2
+    assert main(["dev", "stability", "--backend", "tpu"]) == 2
     assert "This machine has cpu, gpu" in capsys.readouterr().err
-    assert main(["stability", "--group", "gamma"]) == 2
+    assert main(["dev", "stability", "--group", "gamma"]) == 2

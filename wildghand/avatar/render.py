@@ -75,7 +75,7 @@ def shown_sides(avatar: WildGHandAvatar, capture: Capture) -> list[str]:
             f"has parameters of the hand model {capture.info.hand_model.name}, "
             f"the avatar takes those of {avatar.hand_model.name}",
             where=capture.root,
-            remedy="Convert them with `hwp-bench hands convert`.",
+            remedy="Convert them with `hwp-bench data convert`.",
         )
     return sides
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hwp_bench.cli.options import overrides, print_json
+from hwp_bench.cli.options import overrides, print_json, say_next
 from wildghand.cli.options import (
     add_address,
     add_ending,
@@ -40,7 +40,7 @@ def watching(args: argparse.Namespace, *, shown: bool) -> Iterator[ServedFit | N
 _FIT_EXAMPLES = """examples:
   wildghand fit hand.mp4 -o my_hand
   wildghand fit hand.mp4 -o my_hand --quick
-  wildghand fit my_capture -o my_avatar --seconds 60
+  wildghand fit my_capture -o my_avatar --budget 60
   wildghand fit my_capture -o my_avatar --live --port 9000
   wildghand fit my_capture -o paper --set mode=paper --set network.size=paper --set device=cuda
   torchrun --nproc-per-node 4 -m wildghand.cli.main fit my_capture -o my_avatar \\
@@ -48,7 +48,7 @@ _FIT_EXAMPLES = """examples:
 
 A video of hands becomes an avatar folder with turntable.mp4 and sheet.jpg; what leads to them
 is in its folder `work`. Tracking needs ai-edge-litert: pip install 'hwp-bench[track]'. A capture
-is a folder (`hwp-bench data import-video`, `hwp-bench sim render`). A stopped fit continues when
+is a folder (`hwp-bench data import video`, `hwp-bench sim render`). A stopped fit continues when
 the same command is given again. With torchrun each process draws its part of every batch, on a
 GPU of its own.
 """
@@ -71,7 +71,7 @@ def add_fit(parser: argparse.ArgumentParser) -> None:
     add("--model", type=Path, metavar="FILE", help=networks)
     add("--hand-model", metavar="MODEL", help="for a video: anny (default) or mano:PATH")
     add_fitting(parser, "optimizer steps")
-    add("--seconds", type=float, help="most seconds of optimizing")
+    add("--budget", type=float, metavar="SECONDS", help="limit of the fit's time")
     frames = "fit validation and test frames too (default: for a video yes, for a capture no)"
     add("--all-frames", action=argparse.BooleanOptionalAction, help=frames)
     prior = "start from it (made by `wildghand pretrain`; default: the one that ships)"
@@ -115,7 +115,7 @@ def _video(args: argparse.Namespace, world: World) -> int:
         quick=args.quick,
         all_frames=args.all_frames is not False,
         steps=args.steps,
-        seconds=args.seconds,
+        seconds=args.budget,
         seed=args.seed,
         settings=_settings(args),
     )
@@ -131,6 +131,7 @@ def _video(args: argparse.Namespace, world: World) -> int:
         )
     if world.is_main:
         print_json(made.facts()) if args.json else _print(made)
+        say_next("wildghand", "view", made.facts()["avatar"])
     return 0
 
 
@@ -162,15 +163,15 @@ def _capture(args: argparse.Namespace, world: World) -> int:
             )
     if args.out is None:
         raise UsageError("is missing", field="--out", remedy="Name the avatar folder to make.")
-    if args.seconds is not None and not args.seconds > 0.0:
-        raise UsageError(f"is {args.seconds}", field="--seconds", remedy="Use more than 0.")
+    if args.budget is not None and not args.budget > 0.0:
+        raise UsageError(f"is {args.budget}", field="--budget", remedy="Use more than 0.")
     check_fitting(args)
     with watching(args, shown=args.live and world.is_main) as served:
         avatar = fit_capture(
             args.source,
             args.out,
             settings=with_quick(_settings(args), quick=args.quick),
-            budget=Budget(seconds=args.seconds, steps=args.steps),
+            budget=Budget(seconds=args.budget, steps=args.steps),
             seed=args.seed,
             all_frames=args.all_frames is True,
             overwrite=args.overwrite,
@@ -189,6 +190,8 @@ def _capture(args: argparse.Namespace, world: World) -> int:
             f"{args.out}: {hands} hand, {len(record.frames)} frames, {record.steps} steps "
             f"in {record.seconds:.0f} s"
         )
+    say_next("wildghand", "view", args.out, "--poses", args.source)
+    say_next("wildghand", "page", args.out, "--poses", args.source)
     return 0
 
 

@@ -28,7 +28,12 @@ def command_tree() -> Command:
                 "show what the biases took out of training frames", f"{study}:explain"
             ),
             "completion": Command("print completion for a shell", f"{study}:completion"),
-            "info": Command("show what renders here, and check it", f"{study}:info"),
+            "info": Command("print versions and check what draws on this machine", f"{study}:info"),
+        },
+        parts={
+            "avatar": ("fit", "view", "page", "render", "export"),
+            "study": ("judge", "explain", "stage", "pretrain"),
+            "other": ("info", "completion"),
         },
     )
 

@@ -22,7 +22,7 @@ from wildghand.cli.options import (
 
 _RENDER_EXAMPLES = """examples:
   wildghand render my_avatar --poses my_capture -o frames
-  wildghand render my_avatar --poses other_capture -o frames --frames 100:200 --background 255
+  wildghand render my_avatar --poses other_capture -o frames --range 100:200 --background 255
   wildghand render my_avatar --poses my_capture -o frames --video turn.mp4
   wildghand render my_avatar --poses my_capture -o frames --overwrite   # in place of older frames
 
@@ -37,7 +37,7 @@ def add_render(parser: argparse.ArgumentParser) -> None:
     add_avatar(parser)
     add_poses(parser, "capture to take poses from", required=True)
     add("-o", "--out", type=Path, required=True, help="folder of images to make")
-    add("--frames", metavar="A:B", help="frames A to B-1 only")
+    add("--range", metavar="A:B", help="frames A to B-1 only")
     add("--background", type=int, default=0, metavar="GREY", help="0 black to 255 white")
     add("--video", type=Path, metavar="MP4", help="also write a video")
     add_ending(parser, "folder")
@@ -53,7 +53,7 @@ def do_render(args: argparse.Namespace) -> int:
     inputs = {"AVATAR": args.avatar, "--poses": args.poses}
     check_places({"--out": args.out, "--video": args.video}, inputs, replaces=args.overwrite)
     avatar, capture = avatar_of(args), open_capture(args.poses)
-    frames = _frames(args.frames, capture.info.frame_count)
+    frames = _frames(args.range, capture.info.frame_count)
     choices = {name: getattr(args, name) for name in ("background", "video", "overwrite")}
     facts = render_clip(avatar, capture, frames, args.out, **choices)
     if args.json:
@@ -73,7 +73,7 @@ def _frames(text: str | None, count: int) -> range:
         start = stop = -1
     if not 0 <= start < stop <= count:
         problem = f"{text!r} is not a part of {count} frames"
-        raise UsageError(problem, field="--frames", remedy="Use A:B, as 0:10.")
+        raise UsageError(problem, field="--range", remedy="Use A:B, as 0:10.")
     return range(start, stop)
 
 

@@ -1,4 +1,4 @@
-"""Hard cases of DPD, PAO, the robust weights and the terms, for `hwp-bench stability`.
+"""Hard cases of DPD, PAO, the robust weights and the terms, for `hwp-bench dev stability`.
 
 Each is the smallest scene that has the difficulty; all numbers must stay finite, weights must not
 be negative, and what the case is about must come out as its line says.

@@ -82,7 +82,7 @@ class VideoFit:
         check_choices(
             ("--side", self.side in CHOICES, f"must be one of {', '.join(CHOICES)}"),
             ("--steps", self.steps is None or self.steps >= 1, "must be 1 or more"),
-            ("--seconds", self.seconds is None or self.seconds > 0.0, "must be more than 0"),
+            ("--budget", self.seconds is None or self.seconds > 0.0, "must be more than 0"),
             ("--seed", self.seed >= 0, "must be 0 or more"),
         )
 

@@ -199,7 +199,7 @@ class TrackStage(Stage):
             raise NoHandSeen(
                 error.problem,
                 where=error.where,
-                remedy="The whole hand must be visible. `hwp-bench data track --min-confidence "
+                remedy="The whole hand must be visible. `hwp-bench data track --min-score "
                 "0.3` accepts less; give what it writes with --landmarks.",
             ) from error
 

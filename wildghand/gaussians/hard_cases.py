@@ -1,4 +1,4 @@
-"""Hard cases of the optimizer, for `hwp-bench stability` and for the tests.
+"""Hard cases of the optimizer, for `hwp-bench dev stability` and for the tests.
 
 Each compares with Adam in float64 numpy (Kingma and Ba, algorithm 1) behind a clipped norm.
 """

@@ -1,4 +1,4 @@
-"""Hard cases of shadows, for `hwp-bench stability` and for the tests.
+"""Hard cases of shadows, for `hwp-bench dev stability` and for the tests.
 
 Obstacles are plates of two triangles, of which a formula says what they shade: a ray in float64
 meets the plane of the plate at one point, which lies on the plate or does not.

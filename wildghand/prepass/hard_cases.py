@@ -1,4 +1,4 @@
-"""Hard cases of the pre-pass, for `hwp-bench stability` and for the tests.
+"""Hard cases of the pre-pass, for `hwp-bench dev stability` and for the tests.
 
 Frames show a hand of one colour under one light in front of a dark wall, so that what is done to
 them is known: the gains that were put in, the frames that were spoiled.

@@ -92,7 +92,9 @@ def check_oracle_inputs(truths: Sequence[str], settings: EvaluationSettings) -> 
     """Refuse what no error budget is made of."""
     if settings.run.frames != FRAME_CHOICES[0]:
         raise UsageError(
-            f"{settings.run.frames!r} is an oracle itself", field="--frames", remedy="Leave it out."
+            f"{settings.run.frames!r} is an oracle itself",
+            field="--train-on",
+            remedy="Leave it out.",
         )
     unknown = sorted(set(truths) - set(ORACLE_INPUTS))
     if unknown:

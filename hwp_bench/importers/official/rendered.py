@@ -117,7 +117,7 @@ def import_rendered(
     made.missing = [frame for frame in wanted if frame not in drawings]
     far: list[float] = []
     target = Path(out) / PREDICTIONS / info.id
-    with atomic_folder(target, overwrite=overwrite, flag="--force") as root:
+    with atomic_folder(target, overwrite=overwrite, flag="--overwrite") as root:
         for frame in wanted:
             if frame not in drawings:
                 continue

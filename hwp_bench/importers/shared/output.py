@@ -71,7 +71,7 @@ class ReleaseImport:
 
 def refuse_existing(out: str | os.PathLike[str], *, overwrite: bool) -> None:
     """Refuse an output folder that is not empty before minutes of work, not after them."""
-    refuse_folder(out, overwrite=overwrite, flag="--force")
+    refuse_folder(out, overwrite=overwrite, flag="--overwrite")
 
 
 def fit_free_hand(

@@ -37,7 +37,7 @@ class FrameRange:
             raise UsageError(
                 f"{self.start}:{'' if self.stop is None else self.stop} with stride {self.stride} "
                 "selects no frames",
-                field="--frames",
+                field="--range",
                 remedy="Use A:B with 0 <= A < B, and a stride of at least 1.",
             )
 
@@ -58,7 +58,7 @@ def parse_frame_range(text: str | None, stride: int) -> FrameRange:
         return FrameRange(int(head or 0), int(tail) if tail else None, stride)
     except ValueError as error:
         raise UsageError(
-            f"{text!r} is not a range", field="--frames", remedy="Use A:B, A: or :B."
+            f"{text!r} is not a range", field="--range", remedy="Use A:B, A: or :B."
         ) from error
 
 
@@ -278,7 +278,7 @@ def read_frames(
                 raise BadInput(
                     f"frame {index} is not of the size {info.width}x{info.height}",
                     where=info.path,
-                    remedy="Re-encode the video, or take other frames with --frames.",
+                    remedy="Re-encode the video, or take other frames with --range.",
                 )
             yield index, video.picture(frame, colours)
         if selection.stop is None:
@@ -288,7 +288,7 @@ def read_frames(
             raise BadInput(
                 f"ends after {video.decoded} frames, {selection.stop} are selected",
                 where=info.path,
-                remedy="Choose other frames with --frames; the file may be truncated.",
+                remedy="Choose other frames with --range; the file may be truncated.",
             )
 
 

@@ -180,12 +180,12 @@ def read_source(
     if not 3 <= len(indices) <= MAX_FRAMES:
         raise UsageError(
             f"{len(indices)} of {total} frames are selected, a capture has 3 to {MAX_FRAMES}",
-            field="--frames",
+            field="--range",
         )
     selected = {side: hand.select(indices) for side, hand in checked.items()}
     seen = {side: hand for side, hand in selected.items() if hand.detected.any()}
     if not seen:
-        raise UsageError("no hand is detected in the selected frames", field="--frames")
+        raise UsageError("no hand is detected in the selected frames", field="--range")
     for side in selected.keys() - seen.keys():
         notice(f"The {side} hand is in none of the selected frames and is left out.")
     footage = _footage(info, options, indices, times)
@@ -247,8 +247,8 @@ def _check_memory(windows: CropWindows) -> None:
         raise UsageError(
             f"{len(windows.corners)} frames need about {needed / 1e9:.1f} GB of memory, "
             f"{free / 1e9:.1f} GB are free",
-            field="--frames",
-            remedy="Take fewer frames with --frames or --stride, or a smaller --size.",
+            field="--range",
+            remedy="Take fewer frames with --range or --stride, or a smaller --size.",
         )
 
 

@@ -213,7 +213,7 @@ def say_faults(source: VideoSource, out: str | os.PathLike[str], options: VideoI
         raise BadInput(
             f"no useful avatar can come of this video: {said}",
             where=source.video.path,
-            remedy=f"{better[0].upper()}{better[1:]}; {shown}. `hwp-bench data import-video` "
+            remedy=f"{better[0].upper()}{better[1:]}; {shown}. `hwp-bench data import video` "
             "imports it all the same.",
         )
     notice(f"warning: {source.video.path}: {said}. To do better: {better}. {shown}.")

@@ -47,7 +47,9 @@ def write_preview(
 ) -> tuple[Path, Path]:
     """Write `ID-sheet.png` and `ID.gif`, each frame next to its clean version."""
     if not 10 <= frame_count <= 400 or not 32 <= size <= 512:
-        raise UsageError("10 to 400 frames of 32 to 512 px are drawn", field="--frames, --size")
+        raise UsageError(
+            "10 to 400 frames of 32 to 512 px are drawn", field="--frame-count, --size"
+        )
     results = [
         render_frame(scene, frame, frame_count, size)
         for frame in track(range(frame_count), f"Rendering {scene.id}")

@@ -156,16 +156,16 @@ def test_the_band_is_students_interval_over_captures() -> None:
 
 def test_the_plain_baseline_is_the_reference_where_it_is_there() -> None:
     runs = group_runs([doubling("mine"), doubling("plain", 19.0, 4)])
-    heads = [column.title for column in analyse_cost(runs, "psnr").tables["cost"].columns]
+    heads = [column.title for column in analyse_cost(runs, "psnr").tables["curves"].columns]
     assert "To final of Plain" in heads
-    heads = [column.title for column in analyse_cost(runs[:1], "psnr").tables["cost"].columns]
+    heads = [column.title for column in analyse_cost(runs[:1], "psnr").tables["curves"].columns]
     assert not any(title.startswith("To final") for title in heads)
 
 
 def test_failed_fits_and_other_machines_are_named() -> None:
     other = doubling("plain", environment={"processor": "fast", "cores": 64})
     lost = replace(other, captures=[replace(other.captures[0], curve=[]), *other.captures[1:]])
-    notes = analyse_cost(group_runs([doubling("mine"), lost]), "psnr").tables["cost"].notes
+    notes = analyse_cost(group_runs([doubling("mine"), lost]), "psnr").tables["curves"].notes
     assert "Fits without a curve, left out: Plain: 1." in notes
     assert any("the seconds do not compare" in note for note in notes)
 
@@ -174,37 +174,37 @@ def test_the_command_prints_writes_and_refuses(tmp_path: Path, capsys) -> None:
     for name, start in (("mine", 20.0), ("plain", 19.0)):
         write_results(tmp_path / name / "results.json", doubling(name, start))
     mine, plain, out = (str(tmp_path / name) for name in ("mine", "plain", "out"))
-    assert main(["cost", mine, plain, "-o", out]) == 0
+    assert main(["curves", mine, plain, "-o", out]) == 0
     shown = capsys.readouterr()
     assert "Accuracy against time" in shown.out
     assert "pareto.svg" in shown.err
-    assert main(["cost", mine, "--reference", plain, "-o", out, "--budgets", "3", "--json"]) == 0
+    assert main(["curves", mine, "--reference", plain, "-o", out, "--budgets", "3", "--json"]) == 0
     value = json.loads(capsys.readouterr().out)
     assert value["methods"][0]["to_reference"]["seconds"] == pytest.approx(8.0)
     assert list(value["methods"][0]["at"]) == ["3.0"]
     assert value["curves"][0]["scores"][-1] == 24.0
-    assert main(["cost", mine, "--budgets", "-1", "-o", out]) == 2
-    assert main(["cost", mine, "--metric", "ssim", "-o", out]) == 2
+    assert main(["curves", mine, "--budgets", "-1", "-o", out]) == 2
+    assert main(["curves", mine, "--metric", "ssim", "-o", out]) == 2
     assert "no result has a curve of ssim" in capsys.readouterr().err
     write_results(tmp_path / "few" / "results.json", doubling("few", captures=2))
     # Other data are analysed apart, and are no reference.
     few, bare = str(tmp_path / "few"), str(tmp_path / "bare")
-    assert main(["cost", mine, few, "-o", out]) == 0
+    assert main(["curves", mine, few, "-o", out]) == 0
     shown = capsys.readouterr().out
     assert "Data A: Accuracy against time" in shown
     assert "Data B: Accuracy against time" in shown
     assert {path.name for path in Path(out, "B").iterdir()} >= {"pareto.svg", "pareto.png"}
-    assert main(["cost", mine, "--reference", few, "-o", out]) == 2
+    assert main(["curves", mine, "--reference", few, "-o", out]) == 2
     assert "not evaluated on the same captures" in capsys.readouterr().err
     # Data without a curve are named and left out.
     write_results(
         tmp_path / "bare" / "results.json", made_results("bare", flat, captures=3, curve=[])
     )
-    assert main(["cost", mine, bare, "-o", out]) == 0
+    assert main(["curves", mine, bare, "-o", out]) == 0
     assert "data B: metric: no result has a curve of psnr" in " ".join(
         capsys.readouterr().err.split()
     )
-    assert main(["cost", bare, "-o", out]) == 2
+    assert main(["curves", bare, "-o", out]) == 2
 
 
 def test_a_fit_of_one_checkpoint_is_a_point() -> None:

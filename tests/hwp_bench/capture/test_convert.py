@@ -107,10 +107,8 @@ def test_the_command_rewrites_a_capture(
     info = replace(plain.info, hand_model=HandModelId(free_right.name, free_right.digest))
     rewrite_capture(plain, tmp_path / "sound", info, {"right": bent(10)})
     source, out = str(tmp_path / "sound"), str(tmp_path / "as_mano")
-    assert (
-        main(["hands", "convert", source, out, "--hand-model", f"mano:{mano_folder}", "--json"])
-        == 0
-    )
+    words = ["data", "convert", source, "-o", out, "--hand-model"]
+    assert main([*words, f"mano:{mano_folder}", "--json"]) == 0
     error = json.loads(capsys.readouterr().out)["right"]
     assert 0 < error["skin_mm"] <= error["worst_skin_mm"]
     made = open_capture(out)
@@ -119,11 +117,11 @@ def test_the_command_rewrites_a_capture(
     assert made.info.source["converted"]["from"] == "anny-1"
     assert made.true_hands is None
     np.testing.assert_array_equal(made.frame(3), plain.frame(3))
-    assert main(["hands", "convert", source, out, "--hand-model", "anny"]) == 2
+    assert main([*words, "anny"]) == 2
     old = replace(plain.info, hand_model=HandModelId(free_right.name, "0" * 64))
     rewrite_capture(plain, tmp_path / "old", old, {"right": bent(10)})
-    words = ["hands", "convert", str(tmp_path / "old"), str(tmp_path / "x"), "--hand", "anny"]
-    assert main(words) == 1
+    words = ["data", "convert", str(tmp_path / "old"), "-o", str(tmp_path / "x")]
+    assert main([*words, "--hand-model", "anny"]) == 1
     assert "another edition of hand model anny-1" in capsys.readouterr().err
 
 
@@ -139,7 +137,7 @@ def test_another_hand_model_is_refused_by_name_and_by_content(
         HandModelId("anny-1", "0" * 64),
         HandModelId("mano", "1" * 64, f"mano:{mano_folder}"),
     ):
-        with pytest.raises(BadInput, match="hands convert") as caught:
+        with pytest.raises(BadInput, match="data convert") as caught:
             load_matching_template(model, sides, "right", where="my_capture")
         assert "my_capture: hand_model" in str(caught.value)
 
@@ -176,13 +174,13 @@ def test_the_command_writes_a_mesh_and_names_what_is_wrong(
     make_painted: Callable[..., Capture], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     root = str(make_painted("right").root)
-    assert main(["hands", "export", root, str(tmp_path / "hand.glb"), "--frame", "2"]) == 0
+    assert main(["data", "export", root, "-o", str(tmp_path / "hand.glb"), "--frame", "2"]) == 0
     assert "right hand" in capsys.readouterr().out
     for words, problem in (
-        ([root, str(tmp_path / "hand.xyz")], "Use one of .glb"),
-        ([root, str(tmp_path / "hand.glb"), "--frame", "999"], "there is no frame 999"),
+        ([root, "-o", str(tmp_path / "hand.xyz")], "Use one of .glb"),
+        ([root, "-o", str(tmp_path / "hand.glb"), "--frame", "999"], "there is no frame 999"),
     ):
-        assert main(["hands", "export", *words]) == 2
+        assert main(["data", "export", *words]) == 2
         assert problem in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["hand.glb"]
 

@@ -69,7 +69,7 @@ def test_no_command_and_unknown_commands_are_usage_errors(capsys) -> None:
         (["ablate", "plain", "--capture", "x", "--set", "stps=1"], 1, "Did you mean 'steps'"),
         (["table", "nowhere"], 1, "does not exist"),
         (["data", "show", "nowhere"], 1, "is not a capture"),
-        (["data", "audit", "x", "--guard", "-1"], 2, "--guard"),
+        (["data", "check", "x", "--guard", "-1"], 2, "--guard"),
     ],
 )
 def test_errors_are_one_line_on_standard_error(
@@ -85,18 +85,14 @@ def test_errors_are_one_line_on_standard_error(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_check_and_audit_speak_json(make_capture: CaptureMaker, capsys) -> None:
+def test_check_speaks_json_of_capture_and_split(make_capture: CaptureMaker, capsys) -> None:
     capture = make_capture(frames=20)
     assert main(["data", "check", "--json", str(capture.root)]) == 0
     report = json.loads(capsys.readouterr().out)[0]
     assert report["ok"]
     assert report["facts"]["frame_count"] == 20
-    assert main(["data", "audit", "--json", str(capture.root)]) == 0
-    assert json.loads(capsys.readouterr().out)[0]["counts"] == {
-        "train": 16,
-        "validation": 2,
-        "test": 2,
-    }
+    assert report["split"]["ok"]
+    assert report["split"]["counts"] == {"train": 16, "validation": 2, "test": 2}
     (capture.root / "frames" / "000004.png").write_bytes(b"")
     assert main(["data", "check", str(capture.root)]) == 1
     assert "000004.png: is empty" in capsys.readouterr().out

@@ -50,7 +50,7 @@ def test_a_full_disc_is_named_when_captures_are_published(
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(target))
 
     monkeypatch.setattr("hwp_bench.commitments.publication.shutil.copyfile", refuse)
-    assert main(["data", "publish", str(root), "-o", str(tmp_path / "out")]) == 1
+    assert main(["challenge", "publish", str(root), "-o", str(tmp_path / "out")]) == 1
     said = capsys.readouterr().err
     assert "No space left on device" in said
     assert "None" not in said
@@ -101,7 +101,7 @@ def test_a_seed_below_zero_is_refused_by_the_simulator(tmp_path: Path, capsys) -
     assert not out.exists()
 
 
-@pytest.mark.parametrize("option", ["--by", "--reason", "--revises", "--link"])
+@pytest.mark.parametrize("option", ["--author", "--reason", "--revises", "--link"])
 @pytest.mark.parametrize("text", ["\x1b[2J", "two\nlines", "\u202egnp", "x" * 1001])
 def test_a_submission_holds_lines_that_can_be_read(
     option: str, text: str, tmp_path: Path, capsys

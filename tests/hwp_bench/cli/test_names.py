@@ -24,7 +24,6 @@ ODD = os.fsdecode(b"a\xff\xfe")
     "words",
     [
         ["data", "check", ODD],
-        ["data", "audit", ODD],
         ["evaluate", "plain", "--capture", "x", "-o", ODD],
         ["evaluate", "plain", "--capture", "x", "--set", f"level={ODD}"],
         [ODD],

@@ -170,14 +170,12 @@ def test_submissions_are_scored_against_the_sealed_part(
 
 
 def test_the_command(captures: list[Capture], tmp_path: Path, capsys) -> None:
-    words = ["data", "publish", str(captures[0].root), "-o", str(tmp_path / "p")]
+    words = ["challenge", "publish", str(captures[0].root), "-o", str(tmp_path / "p")]
     assert main(words) == 0
     assert "commitment: " in capsys.readouterr().out
     assert main(words) == 2
     assert "exists already" in capsys.readouterr().err
-    assert (
-        main(["data", "publish", str(captures[0].root), "-o", str(tmp_path / "q"), "--json"]) == 0
-    )
+    assert main([*words[:-1], str(tmp_path / "q"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["captures"] == ["one"]
 
 

@@ -121,7 +121,7 @@ def test_a_suite_gives_its_own_frames_and_size() -> None:
         (["capture2", "capture2"], 20, 64, "twice"),
         (["capture99"], 20, 64, "capture99"),
         (["../capture2"], 20, 64, "not a scene"),
-        (["capture2"], 9, 64, "--frames"),
+        (["capture2"], 9, 64, "--frame-count"),
         (["capture2"], 20, 4097, "--size"),
     ],
 )

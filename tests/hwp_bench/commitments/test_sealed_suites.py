@@ -57,7 +57,7 @@ def suite(made: list[SealedSuite], tmp_path: Path) -> Path:
 
 @pytest.fixture
 def revealed(suite: Path, tmp_path: Path) -> Path:
-    assert main(["sealed", "reveal", str(suite), "-o", str(tmp_path / "revealed.json")]) == 0
+    assert main(["challenge", "reveal", str(suite), "-o", str(tmp_path / "revealed.json")]) == 0
     return tmp_path / "revealed.json"
 
 
@@ -65,7 +65,7 @@ def checked(suite: Path, revealed: Path, work: Path, *more: str) -> int:
     """The exit status of a check; frames that were rendered once are taken."""
     shutil.copytree(suite / "keeper" / "captures", work, dirs_exist_ok=True)
     public = suite / "publication" / "public"
-    words = ["sealed", "check", str(public), str(revealed), "--work", str(work), *more]
+    words = ["challenge", "check", str(public), str(revealed), "--work", str(work), *more]
     return main(words)
 
 
@@ -156,7 +156,7 @@ def test_captures_are_rendered_again_from_the_secret_alone(
     suite: Path, revealed: Path, tmp_path: Path
 ) -> None:
     public = suite / "publication" / "public"
-    words = ["sealed", "check", str(public), str(revealed), "--work", str(tmp_path / "new")]
+    words = ["challenge", "check", str(public), str(revealed), "--work", str(tmp_path / "new")]
     assert main([*words, "--capture", NAME, "--workers", "1"]) == 0
     assert len(list((tmp_path / "new").glob(f"{NAME}-*/capture.json"))) == 1
 
@@ -213,7 +213,7 @@ def test_a_suite_that_would_convict_its_organiser_is_not_revealed(
 ) -> None:
     shutil.copyfile(made[1].secret.parents[1] / place, suite / place)
     out = tmp_path / "revealed.json"
-    assert main(["sealed", "reveal", str(suite), "-o", str(out)]) == 1
+    assert main(["challenge", "reveal", str(suite), "-o", str(out)]) == 1
     assert "is committed to" in capsys.readouterr().err
     assert not out.exists()
 
@@ -223,9 +223,9 @@ def test_a_suite_that_would_convict_its_organiser_is_not_revealed(
     [
         (["make", "-o", "exam"], 2),
         (["make", "capture2", "--suite", "mini", "-o", "exam"], 2),
-        (["make", "--suite", "mini", "--frames", "20", "-o", "exam"], 2),
+        (["make", "--suite", "mini", "--frame-count", "20", "-o", "exam"], 2),
         (["make", "capture77", "-o", "exam"], 2),
-        (["make", "capture2", "--frames", "3", "-o", "exam"], 2),
+        (["make", "capture2", "--frame-count", "3", "-o", "exam"], 2),
         (["make", "capture2", "--secret", "nowhere.json", "-o", "exam"], 1),
         (["reveal", "nowhere", "-o", "revealed.json"], 1),
         (["check", "nowhere", "revealed.json"], 1),
@@ -235,7 +235,7 @@ def test_bad_words_are_one_message_and_leave_nothing(
     words: list[str], status: int, tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert main(["sealed", *words]) == status
+    assert main(["challenge", *words]) == status
     message = capsys.readouterr().err
     assert "Traceback" not in message
     assert message.count("error:") == 1

@@ -236,7 +236,7 @@ def evaluated(capture: Capture, tmp_path: Path) -> Path:
 
 def verify(out: Path, capture: Capture, capsys: pytest.CaptureFixture[str]) -> tuple[int, dict]:
     capsys.readouterr()
-    status = main(["verify", str(out), "--captures", str(capture.root), "--json"])
+    status = main(["verify", str(out), "--capture", str(capture.root), "--json"])
     return status, json.loads(capsys.readouterr().out)[0]
 
 

@@ -177,7 +177,7 @@ def test_a_name_like_none_of_a_method_without_a_list_is_said(tmp_path: Path, cap
 
 def test_a_wrong_truth_renders_nothing(tmp_path: Path, capsys) -> None:
     _method(tmp_path / "mine")
-    assert main(["budget", "mine", "--suite", "smoke", "--truths", "posse"]) == 2
+    assert main(["error-budget", "mine", "--suite", "smoke", "--truths", "posse"]) == 2
     assert "'posse' is not an estimate" in capsys.readouterr().err
 
 

@@ -189,7 +189,7 @@ def test_a_result_that_was_changed_by_hand_is_in_no_table(
     value = json.loads(file.read_text())
     value["captures"][0]["frames"][0]["scores"]["psnr"] += 10
     file.write_text(json.dumps(value))
-    commands = (["table"], ["report", "-o", str(tmp_path / "page")], ["cost"])
+    commands = (["table"], ["report", "-o", str(tmp_path / "page")], ["curves"])
     for words in (*commands, ["compare", str(tmp_path / "out-two")]):
         assert main([*words, str(file.parent)]) == 1
         assert "the result was changed by hand" in capsys.readouterr().err

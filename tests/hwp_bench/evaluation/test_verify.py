@@ -39,7 +39,7 @@ def result(capture: Capture, tmp_path: Path) -> Path:
 
 def verify(result: Path, capture: Capture, capsys) -> tuple[int, dict]:
     capsys.readouterr()
-    status = main(["verify", str(result), "--captures", str(capture.root.parent), "--json"])
+    status = main(["verify", str(result), "--capture", str(capture.root.parent), "--json"])
     return status, json.loads(capsys.readouterr().out)[0]
 
 
@@ -54,7 +54,7 @@ def test_an_untouched_result_holds(result: Path, capture: Capture, capsys) -> No
     status, found = verify(result, capture, capsys)
     assert (status, found["discrepancies"]) == (0, [])
     assert (found["captures"], found["frames"], found["notes"]) == (1, 2, [])
-    assert main(["verify", str(result), "--captures", str(capture.root)]) == 0
+    assert main(["verify", str(result), "--capture", str(capture.root)]) == 0
     out = capsys.readouterr().out
     assert "holds (1 captures, 2 frames)" in out
     assert "scikit-image agrees on PSNR and SSIM of 2 frames" in out
@@ -218,9 +218,9 @@ def test_other_code_protocols_and_missing_captures_are_named(result, capture, ca
     assert "other code" in found["notes"][0]
     assert "numpy 0.1" in found["notes"][1]
     assert main(["verify", str(result)]) == 2
-    assert "Say where its captures lie with --captures" in capsys.readouterr().err
+    assert "Say where its captures lie with --capture" in capsys.readouterr().err
     shutil.rmtree(capture.root)
-    assert main(["verify", str(result), "--captures", str(capture.root.parent)]) == 2
+    assert main(["verify", str(result), "--capture", str(capture.root.parent)]) == 2
 
 
 def test_a_name_cannot_lead_out_of_the_folder(result, capture, capsys) -> None:

@@ -165,7 +165,7 @@ def test_what_contradicts_the_calibration_is_refused(pair: Pair, tmp_path: Path)
     with pytest.raises(UsageError, match="has no frame at the time"):
         add_second_view(front, side, calibration(offset=OFFSET + 1))
     add_second_view(front, side, calibration())
-    with pytest.raises(UsageError, match="--force"):
+    with pytest.raises(UsageError, match="--overwrite"):
         add_second_view(front, side, calibration())
     made = add_second_view(front, side, calibration(offset=OFFSET + 20), overwrite=True)
     # Fewer frames than the capture, whose times are not the clip's.
@@ -222,7 +222,7 @@ def test_another_camera_of_interhand_becomes_the_clip(tmp_path: Path, capsys) ->
         assert main(words) == 0
     capsys.readouterr()
     places = [str(tmp_path / f"c{cam}") for cam in angles]
-    assert main(["data", "second-view", *places, "--json"]) == 0
+    assert main(["data", "import", "second-view", *places, "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
     # The left hand is missing from one of the twelve frames.
     assert facts["frames"] == facts["second_frames"] == [0, 1, 2, 3, 5, 6, 7, 8, 9, 10, 11]
@@ -247,7 +247,7 @@ def test_another_camera_of_interhand_becomes_the_clip(tmp_path: Path, capsys) ->
         found = (local @ K.T)[:, :2] / local[:, 2:]
         expected = (interhand_project(truth[side][5], -0.5) - (170.0, 250.0)) * scale + K[:2, 2]
         assert np.abs(found - expected).max() < 0.1
-    assert main(["data", "second-view", *places]) == 2
-    assert "--force" in capsys.readouterr().err
-    assert main(["data", "second-view", *places, "--force"]) == 0
+    assert main(["data", "import", "second-view", *places]) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert main(["data", "import", "second-view", *places, "--overwrite"]) == 0
     assert "from where the second camera saw them" in capsys.readouterr().out

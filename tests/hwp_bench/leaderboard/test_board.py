@@ -243,7 +243,7 @@ def test_the_command_shows_levels_and_badges_in_80_columns(
     assert main(words) == 0
     assert "carries the name of plain, a method that ships" in capsys.readouterr().err
     assert main(["leaderboard", "check", "--entries", str(folder)]) == 2
-    register = ["leaderboard", "register", entries[0].name, "--entries", str(folder)]
+    register = ["dev", "leaderboard", "register", entries[0].name, "--entries", str(folder)]
     assert main(register) == 0
     assert main(["leaderboard", "check", "--entries", str(folder)]) == 0
     capsys.readouterr()

@@ -52,7 +52,17 @@ def own(folder: Path) -> Entry:
 
 
 def call(folder: Path, rerun: object, *more: str) -> int:
-    words = ["leaderboard", "contest", own(folder).name, str(rerun), "--by", "B", "--reason", "so"]
+    words = [
+        "dev",
+        "leaderboard",
+        "contest",
+        own(folder).name,
+        str(rerun),
+        "--checked-by",
+        "B",
+        "--reason",
+        "so",
+    ]
     return main([*words, "--entries", str(folder), *more])
 
 

@@ -62,7 +62,7 @@ def test_the_reader_refuses_a_wrong_card() -> None:
 
 
 def test_the_command_prints_it(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["data", "card", "smoke"]) == 0
+    assert main(["dev", "card", "smoke"]) == 0
     assert json.loads(capsys.readouterr().out) == data_card("smoke")
     with pytest.raises(SystemExit):
-        main(["data", "card", "nothing"])
+        main(["dev", "card", "nothing"])

@@ -350,7 +350,7 @@ def test_an_incomplete_row_is_found() -> None:
 def test_the_command(tmp_path, capsys) -> None:
     write_results(tmp_path / "run" / "results.json", complete_results())
     entries = ["--entries", str(tmp_path / "entries")]
-    assert main(["leaderboard", "add", str(tmp_path / "run"), *entries]) == 0
+    assert main(["dev", "leaderboard", "add", str(tmp_path / "run"), *entries]) == 0
     assert main(["leaderboard", "check", *entries]) == 0
     assert capsys.readouterr().out == "1 entries, all sound\n"
     assert main(["leaderboard", "build", "-o", str(tmp_path / "site"), *entries]) == 0

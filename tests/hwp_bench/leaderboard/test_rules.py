@@ -208,7 +208,7 @@ def test_a_result_that_was_changed_by_hand_is_not_added(tmp_path: Path, capsys) 
     run, entries = tmp_path / "run", tmp_path / "entries"
     file = write_results(run / "results.json", complete_results())
     text = file.read_text()
-    add = ["leaderboard", "add", str(run), "--entries", str(entries)]
+    add = ["dev", "leaderboard", "add", str(run), "--entries", str(entries)]
     submit = ["leaderboard", "submit", str(run), "-o", str(tmp_path / "s"), "--entries"]
     file.write_text(text.replace('"fit_seconds": 2.0', '"fit_seconds": 1.0'))
     for words in (add, [*submit, str(entries)]):

@@ -57,7 +57,7 @@ def submit(run: Path, out: Path, *options: str, entries: Path | None = None) -> 
 def test_a_submission_is_what_a_pull_request_needs(run: Path, tmp_path: Path, capsys) -> None:
     out = tmp_path / "out"
     before = sorted(data_folder("leaderboard").rglob("*"))
-    options = ["--by", "A | Person", "--link", "code=https://a.b/c", "--json"]
+    options = ["--author", "A | Person", "--link", "code=https://a.b/c", "--json"]
     assert submit(run, out, *options, "--avatars", str(tmp_path / "avatars")) == 0
     (facts,) = json.loads(capsys.readouterr().out)
     assert sorted(data_folder("leaderboard").rglob("*")) == before
@@ -101,13 +101,13 @@ def test_predictions_that_are_not_the_result_s_are_refused(run: Path, tmp_path, 
 
 def test_a_correction_is_a_revision(run: Path, tmp_path: Path, capsys) -> None:
     entries, out = tmp_path / "entries", tmp_path / "out"
-    assert main(["leaderboard", "add", str(run), "--entries", str(entries)]) == 0
+    assert main(["dev", "leaderboard", "add", str(run), "--entries", str(entries)]) == 0
     (first,) = read_entries(entries)
     assert submit(run, out, entries=entries) == 2
     assert "is on the leaderboard already" in capsys.readouterr().err
     options = ["--revises", first.name, "--reason", "the link was missing"]
     assert submit(run, out, *options, entries=entries) == 0
-    assert submit(run, tmp_path / "more", *options, "--by", "B", entries=tmp_path) == 2
+    assert submit(run, tmp_path / "more", *options, "--author", "B", entries=tmp_path) == 2
     assert "which is not there" in capsys.readouterr().err
     (made,) = (out / "leaderboard" / "entries").glob("*.json")
     made.rename(entries / made.name)
@@ -186,7 +186,7 @@ def test_the_entry_s_own_results_are_rescored(made, tmp_path: Path, capsys) -> N
     file, capture = made
     entry = make_entry(read_results(file))
     write_entry(tmp_path / "entries", entry)
-    words = ["leaderboard", "confirm", str(file), "--by", "us", "--captures", str(capture)]
+    words = ["leaderboard", "confirm", str(file), "--checked-by", "us", "--capture", str(capture)]
     words += ["--entries", str(tmp_path / "entries")]
     capsys.readouterr()
     assert main([*words, "--json"]) == 0

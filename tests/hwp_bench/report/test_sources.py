@@ -133,11 +133,11 @@ def test_the_commands_take_mixed_results(mixed, tmp_path: Path, capsys) -> None:
     rows = json.loads(capsys.readouterr().out)["rows"]
     assert [row["Data"] for row in rows] == ["A", "A", "B", "B"]
     assert main(["table", *mixed, "--by", "severity"]) == 2
-    assert main(["cost", *mixed, "-o", str(tmp_path / "cost"), "--json"]) == 0
+    assert main(["curves", *mixed, "-o", str(tmp_path / "cost"), "--json"]) == 0
     groups = json.loads(capsys.readouterr().out)["groups"]
     assert [(group["data"], len(group["methods"])) for group in groups] == [("A", 2), ("B", 2)]
     assert (tmp_path / "cost" / "B" / "pareto.png").is_file()
-    assert main(["cost", *mixed[::2], "-o", str(tmp_path / "one"), "--json"]) == 0
+    assert main(["curves", *mixed[::2], "-o", str(tmp_path / "one"), "--json"]) == 0
     assert "groups" not in json.loads(capsys.readouterr().out)
     assert (tmp_path / "one" / "pareto.png").is_file()
     assert main(["report", *mixed, "-o", str(tmp_path / "report")]) == 0
@@ -146,7 +146,7 @@ def test_the_commands_take_mixed_results(mixed, tmp_path: Path, capsys) -> None:
         assert f'href="{label}/index.html"' in index
         assert (tmp_path / "report" / label / "index.html").is_file()
     assert "Mine wins with PSNR" in index
-    assert main(["report", *mixed, "-o", str(tmp_path / "r"), "--base", "nobody"]) == 2
+    assert main(["report", *mixed, "-o", str(tmp_path / "r"), "--baseline", "nobody"]) == 2
     assert "no result is of 'nobody'" in capsys.readouterr().err
     # One data: one page, as always.
     assert main(["report", *mixed[::2], "-o", str(tmp_path / "same")]) == 0
@@ -181,7 +181,7 @@ def replace_seconds(runs):
     return replace(method_costs(runs, "psnr")[0], fit_seconds=None)
 
 
-COMMANDS = (["table"], ["table", "--by", "rank"], ["cost"], ["report"])
+COMMANDS = (["table"], ["table", "--by", "rank"], ["curves"], ["report"])
 
 
 @pytest.fixture

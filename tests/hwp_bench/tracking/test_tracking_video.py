@@ -91,7 +91,7 @@ def test_the_command(
     assert sheet.stat().st_size > 1000
     assert main(["data", "track", str(video)]) == 2
     assert "exists already" in capsys.readouterr().err
-    assert main(["data", "track", str(video), "--force"]) == 0
+    assert main(["data", "track", str(video), "--overwrite"]) == 0
     assert "left hand: seen in 8 frames" in capsys.readouterr().out
     empty = write_video(video.with_name("empty.avi"), [{}] * 3)
     assert main(["data", "track", str(empty)]) == 1
@@ -117,7 +117,7 @@ def test_a_video_that_ends_early_is_tracked_and_said(
     assert "warning: " in said.err
     assert re.search(r"cut.mkv ends early, after 1[0-2] of 24 frames: the file is cut", said.err)
     assert re.search(r"cut.npz: 1[0-2] of 24 frames,", said.out)
-    assert main(["data", "track", str(cut), "--json", "--force"]) == 0
+    assert main(["data", "track", str(cut), "--json", "--overwrite"]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert facts["reading"]["decoded_frames"] == facts["frames"] < 13
     assert (facts["reading"]["stated_frames"], facts["reading"]["ends_early"]) == (24, True)
@@ -138,7 +138,7 @@ def test_mistakes_are_one_line(
         (["data", "track", str(broken)], 1, "broken.avi"),
         (["data", "track", str(video), "-o", str(tmp_path / "x.txt")], 2, ".npz"),
         (["data", "track", str(video), "--model", str(broken)], 1, "not a readable archive"),
-        (["data", "track", str(video), "--min-confidence", "2"], 2, "between 0 and 1"),
+        (["data", "track", str(video), "--min-score", "2"], 2, "between 0 and 1"),
     ):
         assert main(arguments) == status, arguments
         said = capsys.readouterr().err

@@ -203,7 +203,7 @@ def test_an_ablation_takes_the_networks_too(
     folder: Path, few_frames: list[str], tmp_path: Path, capsys: Any
 ) -> None:
     settings = {**FIT, "pao.hand": f"sam:{folder / 'sam.pth'}"}
-    command = ["ablate", "--binary-mask", "--seeds", "1", "-o", str(tmp_path / "runs")]
+    command = ["ablate", "--with", "binary-mask", "--seeds", "1", "-o", str(tmp_path / "runs")]
     command += [*few_frames, *options(settings)]
     assert hwp_bench(command) == 0, capsys.readouterr().err
 

@@ -292,7 +292,7 @@ def test_the_commands_make_draw_and_export_an_avatar(
     uneven = [0.05 * frame + 0.01 * (frame % 2) for frame in range(written["frame_count"])]
     (clip / "capture.json").write_text(json.dumps({**written, "times": uneven}))
     words = ["render", str(avatar), "--poses", str(clip), "-o", str(pictures)]
-    assert main([*words, "--frames", "2:5", "--video", str(tmp_path / "clip.mp4")]) == 0
+    assert main([*words, "--range", "2:5", "--video", str(tmp_path / "clip.mp4")]) == 0
     shown = read_times(tmp_path / "clip.mp4")
     np.testing.assert_allclose(shown, np.array(uneven[2:5]) - uneven[2], atol=1e-3)
     assert sorted(path.name for path in pictures.iterdir()) == [f"{f:06d}.png" for f in (2, 3, 4)]
@@ -306,9 +306,7 @@ def test_the_commands_make_draw_and_export_an_avatar(
     table = np.frombuffer(body, "<f4").reshape(count, 62)
     assert np.isfinite(table).all()
     np.testing.assert_allclose(np.linalg.norm(table[:, 58:], axis=1), 1.0, atol=1e-5)
-    assert (
-        main(["render", str(avatar), "--poses", str(capture), "-o", "x", "--frames", "9:99"]) == 2
-    )
+    assert main(["render", str(avatar), "--poses", str(capture), "-o", "x", "--range", "9:99"]) == 2
 
 
 def test_from_python_nothing_is_written(

@@ -123,7 +123,7 @@ def test_the_folder_is_an_avatar_with_clip_and_sheet(made: Path, tmp_path: Path)
     assert np.abs(views[0].astype(int) - views[SMALL[1] // 2]).mean() > 1
     assert read_rgb(out / "sheet.jpg").shape[0] > 1000
     # What other commands expect of an avatar.
-    words = ["render", str(out), "--poses", str(out / "work" / "capture"), "--frames", "3:5"]
+    words = ["render", str(out), "--poses", str(out / "work" / "capture"), "--range", "3:5"]
     assert main([*words, "-o", str(tmp_path / "frames")]) == 0
     assert main(["export", str(out), "-o", str(tmp_path / "hand.ply")]) == 0
 

@@ -113,7 +113,7 @@ def test_the_page_shows_what_render_draws_and_a_slider_poses_the_hand(
 ) -> None:
     capture = window_capture(tmp_path / "capture")
     save_avatar(tiny_avatar, tmp_path / "avatar")
-    words = ["render", str(tmp_path / "avatar"), "--poses", str(capture.root), "--frames", "0"]
+    words = ["render", str(tmp_path / "avatar"), "--poses", str(capture.root), "--range", "0"]
     assert main([*words, "--background", "255", "-o", str(tmp_path / "frames")]) == 0
     rendered = read_rgb(tmp_path / "frames" / "000000.png").astype(float)
     motion = Motion(tiny_avatar, capture)

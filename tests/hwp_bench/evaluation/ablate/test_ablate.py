@@ -126,7 +126,7 @@ def test_a_failing_variant_is_named_and_penalised(captures, tmp_path: Path, caps
 def test_wrong_switches_are_refused_before_anything_runs(tmp_path: Path, capsys) -> None:
     method = write_toy_method(tmp_path / "toy")
     base = ["ablate", str(method), "-o", str(tmp_path / "out")]
-    assert main([*base, "--no-dpd"]) == 2
+    assert main([*base, "--without", "dpd"]) == 2
     assert "toy has no switch 'dpd'. It declares: tone, edge, hard-mask" in (
         capsys.readouterr().err
     )

@@ -103,7 +103,7 @@ def test_each_truth_gains_what_its_error_costs(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     out = tmp_path / "out"
-    command = ["budget", str(method), "--capture", str(dark_capture.root), "-o", str(out)]
+    command = ["error-budget", str(method), "--capture", str(dark_capture.root), "-o", str(out)]
     assert main([*command, "--isolation", "none", "--json"]) == 0
     record = json.loads(capsys.readouterr().out)
     rows = {row["name"]: row["gain"]["dark"] for row in record["rows"]}
@@ -153,7 +153,7 @@ def test_wrong_requests_are_refused(dark_capture: Capture, tmp_path: Path) -> No
 def test_a_real_capture_has_corrections_alone(
     method: Path, make_painted: Callable[..., Capture], tmp_path: Path, capsys: Any
 ) -> None:
-    command = ["budget", str(method), "--capture", str(make_painted().root)]
+    command = ["error-budget", str(method), "--capture", str(make_painted().root)]
     assert main([*command, "-o", str(tmp_path / "out"), "--isolation", "none", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)["rows"]
     assert {row["kind"] for row in rows} == {"correction"}

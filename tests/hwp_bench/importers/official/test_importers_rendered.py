@@ -79,8 +79,8 @@ def test_captures_are_added_to_one_submission(
     before = (out / "method.toml").read_bytes()
     assert take(tmp_path / name, one, out) != 0
     assert "exists" in capsys.readouterr().err
-    assert take(tmp_path / name, one, out, "--force") == 0
-    assert take(tmp_path / name, one, out, "--force", "--name", "other") == 2
+    assert take(tmp_path / name, one, out, "--overwrite") == 0
+    assert take(tmp_path / name, one, out, "--overwrite", "--name", "other") == 2
     assert "is the method 'authors-code'" in capsys.readouterr().err
     assert (out / "method.toml").read_bytes() == before
     assert take(tmp_path / name, one, tmp_path, "--name", "x") == 2

@@ -140,8 +140,8 @@ def test_nothing_fitted_is_an_error_with_its_reason(
     monkeypatch.setattr(pipeline, "VideoImport", lambda **more: VideoImport(fit=FIT, **more))
     monkeypatch.setattr("hwp_bench.importers.video.VideoImport", pipeline.VideoImport)
     out = tmp_path / "capture"
-    words = [str(source.video.path), str(out), "--landmarks", str(wrong), "--side", "right"]
-    assert main(["data", "import-video", *words]) == 1
+    words = ["--landmarks", str(wrong), "--side", "right", "-o", str(out)]
+    assert main(["data", "import", "video", str(source.video.path), *words]) == 1
     said = capsys.readouterr().err
     assert "no right hand can follow these landmarks" in said
     assert f"it seems that {WRONG['MANO'][2]}" in said

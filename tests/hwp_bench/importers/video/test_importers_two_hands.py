@@ -210,19 +210,3 @@ def test_both_hands_of_landmarks_of_one_hand_are_refused(folder: Path, tmp_path:
     one = write_landmarks(tmp_path / "one.npz", make_clip(FRAMES).landmarks)
     with pytest.raises(BadInput, match="has landmarks of one hand"):
         read_source(folder / "hands.avi", one, VideoImport(side="both"))
-
-
-def test_the_former_name_of_the_option(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = ["data", "import-video", str(folder / "hands.avi"), str(tmp_path / "out")]
-    words += ["--landmarks", str(tmp_path / "absent.npz")]
-    for option in ("--side", "--hand"):
-        assert main([*words, option, "left"]) == 1
-        assert "absent.npz" in capsys.readouterr().err
-    for wrong in ([*words, "--hand", "none"], ["data", "import-video", "--help"]):
-        with pytest.raises(SystemExit):
-            main(wrong)
-    shown = capsys.readouterr().out
-    assert "--side" in shown
-    assert "--hand " not in shown

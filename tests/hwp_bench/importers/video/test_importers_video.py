@@ -188,8 +188,8 @@ def test_the_command_prints_the_numbers_and_saves_the_sheet(
 ) -> None:
     monkeypatch.setattr(SolveSettings, "__init__", lambda self: _set(self, QUICKER))
     sheet = folder / "sheet.png"
-    words = ["data", "import-video", str(folder / "hand.avi"), str(folder / "by_command")]
-    words += ["--landmarks", str(folder / "hand.npz"), "--size", "96", "--frames", "6:16"]
+    words = ["data", "import", "video", str(folder / "hand.avi"), "-o", str(folder / "by_command")]
+    words += ["--landmarks", str(folder / "hand.npz"), "--size", "96", "--range", "6:16"]
     words += ["--stride", "2", "--sheet", str(sheet), "--perturbations", "motion_blur"]
     assert main(words) == 0
     out = capsys.readouterr().out
@@ -201,7 +201,7 @@ def test_the_command_prints_the_numbers_and_saves_the_sheet(
     assert (info.id, info.frame_count, info.fps) == ("by_command", 5, 15.0)
     assert info.source["frames"] == [6, 8, 10, 12, 14]
     assert info.perturbations == {"motion_blur": None}
-    # Again: it is complete, as after a kill in the last moment. Another call needs --force.
+    # Again: it is complete, as after a kill in the last moment. Another call needs --overwrite.
     sheet.unlink()
     assert main(words) == 0
     assert "is complete: the same call has made it" in capsys.readouterr().err
@@ -209,7 +209,7 @@ def test_the_command_prints_the_numbers_and_saves_the_sheet(
     assert main([*words, "--min-score", "0.4"]) == 2
     assert "exists already" in capsys.readouterr().err
     monkeypatch.setattr(SolveSettings, "__init__", lambda self: _set(self, HASTY))
-    assert main([*words, "--force", "--json"]) == 0
+    assert main([*words, "--overwrite", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["frames"] == 5
 
 
@@ -235,9 +235,9 @@ BAD_INPUTS = {
     "missing masks": ("hand.npz", {"masks": "few"}, BadInput, "13 of 16 frames have no mask: 3"),
     "no such perturbation": ("hand.npz", {"perturbations": ("fog",)}, BadInput, "fog"),
     "bad id": ("hand.npz", {"id": "a/b"}, BadInput, "a/b"),
-    "too few frames": ("hand.npz", {"frames": FrameRange(0, 2)}, UsageError, "--frames"),
-    "hand never seen": ("hand.npz", {"frames": FrameRange(5, 6)}, UsageError, "--frames"),
-    "beyond the end": ("hand.npz", {"frames": FrameRange(50, 60)}, UsageError, "--frames"),
+    "too few frames": ("hand.npz", {"frames": FrameRange(0, 2)}, UsageError, "--range"),
+    "hand never seen": ("hand.npz", {"frames": FrameRange(5, 6)}, UsageError, "--range"),
+    "beyond the end": ("hand.npz", {"frames": FrameRange(50, 60)}, UsageError, "--range"),
 }
 
 
@@ -290,7 +290,7 @@ def test_arguments_are_checked_before_any_work(
 ) -> None:
     monkeypatch.chdir(folder)
     monkeypatch.setattr("hwp_bench.importers.video.api.read_source", None)
-    given = ["data", "import-video", "hand.avi", "out", "--landmarks", "hand.npz"]
+    given = ["data", "import", "video", "hand.avi", "-o", "out", "--landmarks", "hand.npz"]
     assert main([*given, *words]) in (1, 2)
     said = capsys.readouterr().err
     assert message in said

@@ -69,7 +69,8 @@ def test_a_bad_scene_is_one_line(
     path = tmp_path / "mine.toml"
     path.write_text(SINGLE.replace(old, new))
     out = [] if action in ("plan", "calibrate") else ["-o", str(tmp_path / "out")]
-    assert main(["sim", action, str(path), *out]) == BadInput.exit_status
+    group = "dev" if action in ("plan", "calibrate") else "sim"
+    assert main([group, action, str(path), *out]) == BadInput.exit_status
     shown = capsys.readouterr()
     assert shown.out == ""
     assert shown.err.count("\n") == 1
@@ -92,7 +93,7 @@ def _wait_for(condition: Callable[[], bool]) -> None:
 def test_a_killed_render_leaves_no_capture_and_goes_on(tmp_path: Path) -> None:
     path, out = tmp_path / "tiny.toml", tmp_path / "capture"
     path.write_text(SINGLE)
-    extent = ["--frames", str(FRAMES), "--size", str(SIZE), "--workers", "2"]
+    extent = ["--frame-count", str(FRAMES), "--size", str(SIZE), "--workers", "2"]
     command = ["sim", "render", str(path), "-o", str(out), *extent, "--no-free-view"]
     with subprocess.Popen([sys.executable, "-m", "hwp_bench.cli.main", *command]) as process:
         _wait_for(lambda: _finished(tmp_path) >= 2 or process.poll() is not None)

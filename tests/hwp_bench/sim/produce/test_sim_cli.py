@@ -27,17 +27,20 @@ def scene_file(tmp_path: Path) -> Path:
 
 
 def test_list_names_scenes_and_parts(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["sim", "list", "--json"]) == 0
+    assert main(["list", "scenes", "--json"]) == 0
     content = json.loads(capsys.readouterr().out)
-    assert [scene["id"] for scene in content["scenes"]] == list(known_scenes())
+    assert [scene["scene"] for scene in content["scenes"]] == list(known_scenes())
     assert len(content["scenes"]) == 11 + sum(len(scene_names(name)) for name in scene_groups())
-    assert "phone" in content["objects"]
+    assert content["scenes"][0]["digest"] == load_scene("capture0").digest
+    assert main(["list", "scene-parts", "--json"]) == 0
+    (parts,) = json.loads(capsys.readouterr().out).values()
+    assert "phone" in {row["part"]: row["names"] for row in parts}["objects"]
 
 
 def test_plan_counts_without_rendering(
     scene_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = ["sim", "plan", str(scene_file), "--frames", "40", "--no-probe", "--json"]
+    command = ["dev", "plan", str(scene_file), "--frame-count", "40", "--no-probe", "--json"]
     assert main(command) == 0
     (report,) = json.loads(capsys.readouterr().out)
     assert report["passes"]["hands"] == 40
@@ -48,13 +51,13 @@ def test_render_and_preview(
     scene_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "capture"
-    extent = ["--frames", "10", "--size", "32", "--severity", "2", "--workers", "1"]
+    extent = ["--frame-count", "10", "--size", "32", "--severity", "2", "--workers", "1"]
     extent += ["--no-free-view"]
     assert main(["sim", "render", str(scene_file), "-o", str(out), *extent]) == 0
     assert (out / "capture.json").is_file()
     assert main(["sim", "render", str(scene_file), "-o", str(out), *extent]) == 2
     assert "exists" in capsys.readouterr().err
-    command = ["sim", "preview", str(scene_file), "-o", str(tmp_path), "--frames", "10"]
+    command = ["sim", "preview", str(scene_file), "-o", str(tmp_path), "--frame-count", "10"]
     assert main([*command, "--size", "32"]) == 0
     assert (tmp_path / "tiny-sheet.png").is_file()
     assert (tmp_path / "tiny.gif").read_bytes()[:4] == b"GIF8"
@@ -63,21 +66,21 @@ def test_render_and_preview(
 @pytest.mark.parametrize(
     "words",
     [
-        ["render"],
-        ["render", "capture0"],
-        ["render", "capture99", "-o", "x"],
-        ["render", "capture0", "--suite", "mini"],
-        ["render", "--suite", "mini", "--size", "64"],
-        ["render", "capture0", "-o", "x", "--severity", "9"],
-        ["preview", "capture0", "--frames", "1"],
+        ["sim", "render"],
+        ["sim", "render", "capture0"],
+        ["sim", "render", "capture99", "-o", "x"],
+        ["sim", "render", "capture0", "--suite", "mini"],
+        ["sim", "render", "--suite", "mini", "--size", "64"],
+        ["sim", "render", "capture0", "-o", "x", "--severity", "9"],
+        ["sim", "preview", "capture0", "--frame-count", "1"],
         # Numbers that no memory holds.
         *(
             [*words, f"{option}={value}"]
-            for words in (["plan", "capture0"], ["render", "capture0", "-o", "x"])
+            for words in (["dev", "plan", "capture0"], ["sim", "render", "capture0", "-o", "x"])
             for option, value in (
-                ("--frames", "1" * 60),
-                ("--frames", "100001"),
-                ("--frames", "-1"),
+                ("--frame-count", "1" * 60),
+                ("--frame-count", "100001"),
+                ("--frame-count", "-1"),
                 ("--size", "9" * 30),
             )
         ),
@@ -90,7 +93,7 @@ def test_wrong_requests_end_with_status_2(
     tmp_path: Path,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert main(["sim", *words]) == 2
+    assert main(words) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     if "--severity" in words or any("=" in word for word in words):
