@@ -52,8 +52,11 @@ def test_commands_run_in_their_order(
             else:
                 assert program == "hwp-bench"
                 assert main(words) == 0, line
+    # A mesh in one colour a vertex is nearer to the frames than one colour for all.
     mean, mesh = (
         read_results(tmp_path / "runs" / "both" / name / "seed-0").captures[0].frames
         for name in ("my_method", "my_mesh")
     )
-    assert all(b.scores["psnr"] > a.scores["psnr"] + 1.0 for a, b in zip(mean, mesh, strict=True))
+    for one, other in zip(mean, mesh, strict=True):
+        assert other.scores["oriented_distance"] < one.scores["oriented_distance"]
+        assert 15.0 < other.scores["psnr"] < 40.0
