@@ -122,7 +122,7 @@ def _failure(error: HwpError, name: str, output: Path) -> Finding:
 
 
 def _heard(output: Path, name: str) -> Iterator[Finding]:
-    """What the run found wrong itself, and what the method printed of a network."""
+    """Read the findings of the run, and look for failed calls to the network in its log."""
     try:
         found = read_findings(output / FINDINGS)
     except HwpError as error:
@@ -140,7 +140,7 @@ def _heard(output: Path, name: str) -> Iterator[Finding]:
 
 
 def _slow(record: RunRecord, name: str, frames: int, budget: Budget) -> Iterator[Finding]:
-    """What costs more than a budget or a person's patience: warnings, because it is scored."""
+    """Warn where a run takes more than its budget, or more time or memory than is usual."""
     facts = record.facts
     seconds = facts.fit_seconds or record.wall_seconds
     if budget.seconds is not None and seconds > budget.seconds * _GRACE + _GRACE_SECONDS:
@@ -153,15 +153,16 @@ def _slow(record: RunRecord, name: str, frames: int, budget: Budget) -> Iterator
     if facts.render_seconds is not None and facts.render_seconds / frames > _SLOW_PICTURE:
         problem = f"a picture takes {facts.render_seconds / frames:.1f} s"
         yield Finding("warning", name, "speed", problem, "`mini` has 48 test frames, `full` 1,400.")
-    if (facts.peak_memory or 0) > _MUCH_MEMORY:
-        problem = f"the process took {facts.peak_memory / 1e9:.1f} GB of memory"
+    memory = facts.peak_memory or 0
+    if memory > _MUCH_MEMORY:
+        problem = f"the process took {memory / 1e9:.1f} GB of memory"
         yield Finding("warning", name, "memory", problem, "Other machines may have less.")
 
 
 def _pictures(
     record: RunRecord, capture: Capture, split: Split, *, colours: bool
 ) -> Iterator[Finding]:
-    """What is wrong with the pictures that were written, and with their `colours`."""
+    """Look at the pictures that were written and, if asked for, at their `colours`."""
     name, clip = capture.info.id, capture.free_view
     targets = read_targets(capture, split.test.tolist())
     yield from _frames(name, targets, record.predictions, capture.size, colours)

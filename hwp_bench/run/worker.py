@@ -49,7 +49,7 @@ PROGRESS = "progress.json"
 FAILURE = "failure.json"
 #: The method's printed output.
 LOG = "log.txt"
-#: What a run with `--check` found wrong.
+#: Findings of a run with `--check`.
 FINDINGS = "findings.json"
 #: Settings and seed of a method that is only made, in the place of a request.
 REHEARSAL = "rehearsal.json"
@@ -285,8 +285,7 @@ def read_findings(path: Path) -> list[RunFinding]:
     if not path.is_file():
         return []
     value = {"found": read_json(path, max_bytes=MAX_BYTES)}
-    listed = parse_record(_Findings, value, where=path)
-    return listed.found
+    return parse_record(_Findings, value, where=path).found
 
 
 @dataclass(frozen=True)
