@@ -191,14 +191,17 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _add(args: argparse.Namespace, folder: Path) -> int:
-    from hwp_bench.leaderboard.rules import check_source
+    from hwp_bench.leaderboard.entries import make_entry
+    from hwp_bench.leaderboard.rules import check_complete, check_source
     from hwp_bench.leaderboard.submit import add_entries
     from hwp_bench.results import read_results, results_among
 
-    files = results_among(args.results)
-    for file in files:
+    found = []
+    for file in results_among(args.results):
+        found.append(read_results(file))
         check_source(file)
-    for entry in add_entries(folder, [read_results(file) for file in files]):
+        check_complete(make_entry(found[-1]))
+    for entry in add_entries(folder, found):
         notice(f"entry: {entry}")
     return 0
 

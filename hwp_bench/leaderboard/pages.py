@@ -26,11 +26,9 @@ from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import atomic_write, read_json, sha256_json
 from hwp_bench.base.tables import Column, Table, format_table, without_empty_columns
 from hwp_bench.leaderboard.board import BoardRow, method_rows, ranks_of
-from hwp_bench.leaderboard.entries import read_entries
-from hwp_bench.leaderboard.rules import left_out, tables_of
+from hwp_bench.leaderboard.rules import shipped_manifests, sound_entries, tables_of
 from hwp_bench.leaderboard.submit import PLACE
 from hwp_bench.leaderboard.suite_data import known_data
-from hwp_bench.methods.manifest import shipped_methods
 from hwp_bench.metrics import HWP_V1
 from hwp_bench.report.figures import draw_leads, figure_file
 from hwp_bench.report.study_tables import METRIC
@@ -60,7 +58,7 @@ class Sources:
     @cached_property
     def fields(self) -> list[Field]:
         """The methods of each suite that has entries of this version's protocol."""
-        entries = read_entries(self.root / PLACE, left_out)
+        entries = sound_entries(self.root / PLACE)
         shown = {suite: own for (suite, name), own in tables_of(entries).items() if name == _NAME}
         return [Field(suite, tuple(method_rows(own))) for suite, own in shown.items()]
 
@@ -87,7 +85,7 @@ class Field:
         rows = (row for row in self.order if row.whole and row.first.method.name == name)
         return next(rows, None)
 
-    @property
+    @cached_property
     def others(self) -> list[BoardRow]:
         """The whole rows of other methods than `OURS`, best first."""
         return [row for row in self.order if row.whole and row.first.method.name != OURS]
@@ -114,10 +112,10 @@ class Field:
         ours = self.row(OURS)
         if ours is None or not self.others:
             return {}
-        best = {}
+        others, best = [(row, _capture_means(row)) for row in self.others], {}
         for name, score in _capture_means(ours).items():
-            other = max(self.others, key=lambda row: _capture_means(row)[name])
-            best[name] = score - _capture_means(other)[name], other.title
+            highest, title = max((means[name], row.title) for row, means in others)
+            best[name] = score - highest, title
         return best
 
 
@@ -214,7 +212,7 @@ def _section(field: Field) -> tuple[str, dict[str, Callable[[], bytes]]]:
 
 def _completeness(field: Field) -> list[str]:
     whole = {row.first.method.name for row in field.rows if row.whole}
-    titles = {method.name: method.title for method in shipped_methods()}
+    titles = {method.name: method.title for method in shipped_manifests()}
     missing = [title for name, title in titles.items() if name not in whole]
     count = len(titles) - len(missing)
     told = f"{count} of the {len(titles)} methods that ship are complete here: no capture and no "
@@ -370,34 +368,47 @@ def _ratios(sources: Sources) -> Block:
     return Block(_markdown(table_of("Stored ratios", columns)), {})
 
 
-def _tuning(sources: Sources) -> Block:
-    """The logged trials of each baseline (`benchmarks/tuning.jsonl`)."""
-    file = sources.root / "benchmarks" / "tuning.jsonl"
-    fits = [json.loads(line) for line in file.read_text("utf-8").splitlines()]
-    tables: dict[tuple[str, str], dict[str, dict[str, float]]] = {}
-    made: dict[tuple[str, str], list[str]] = {}
-    for fit in fits:
-        key = fit["method"], f"{fit['limit']} a fit, preset {fit['preset']}, seed {fit['seed']}"
-        tables.setdefault(key, {}).setdefault(fit["trial"], {})[fit["capture"]] = fit["score"]
-        made.setdefault(key, []).append(f"{fit['commit']}, {fit['day']}, {fit['machine']}")
-    parts = []
-    for (method, limits), trials in tables.items():
-        captures = list(dict.fromkeys(name for own in trials.values() for name in own))
-        columns: list[Filled] = [(Column("Settings"), [trial or "preset" for trial in trials])]
-        for name in captures:
-            columns.append((Column(name, 2), [own.get(name) for own in trials.values()]))
-        means = [
-            float(np.mean(list(own.values()))) if len(own) == len(captures) else None
-            for own in trials.values()
-        ]
-        columns.append((Column("Mean", 2, higher_is_better=True), means))
-        notes = [f"{limits}. Made at {'; '.join(dict.fromkeys(made[method, limits]))}."]
-        parts.append(_markdown(table_of(method, columns, notes)))
-    return Block("\n\n".join(parts) or "No trial is logged.", {})
+def _tuning(sources: Sources, method: str) -> Block:
+    """The logged trials of a baseline (`benchmarks/tuning.jsonl`), next to the plain fit."""
+    lines = (sources.root / "benchmarks" / "tuning.jsonl").read_text("utf-8").splitlines()
+    fits = [json.loads(line) for line in lines]
+    found = [_trials(fits, method, limits) for limits in dict.fromkeys(map(_limits, fits))]
+    return Block("\n\n".join(_markdown(table) for table in found if table) or "No trial.", {})
 
 
-#: What writes each block, by its name.
-BLOCKS: Mapping[str, Callable[[Sources], Block]] = {
+def _limits(fit: Mapping[str, Any]) -> str:
+    return f"{fit['limit']} a fit, preset {fit['preset']}, seed {fit['seed']}"
+
+
+def _trials(fits: Sequence[Mapping[str, Any]], method: str, limits: str) -> Table | None:
+    """Return a row for each trial of a baseline under some limits; None where there is none."""
+    own = [fit for fit in fits if _limits(fit) == limits and fit["method"] == method]
+    captures = list(dict.fromkeys(fit["capture"] for fit in own))
+    if method != PLAIN:
+        alike = [fit for fit in fits if _limits(fit) == limits and fit["method"] == PLAIN]
+        own += [fit for fit in alike if not fit["trial"] and fit["capture"] in captures]
+    rows: dict[str, dict[str, float]] = {}
+    for fit in own:
+        trial = "preset" if fit["method"] == method else "the plain fit"
+        rows.setdefault(fit["trial"].replace(",", " ") or trial, {})[fit["capture"]] = fit["score"]
+    if not captures:
+        return None
+    means = [
+        float(np.mean(list(row.values()))) if len(row) == len(captures) else None
+        for row in rows.values()
+    ]
+    columns: list[Filled] = [
+        (Column("Settings"), list(rows)),
+        *((Column(name, 2), [row.get(name) for row in rows.values()]) for name in captures),
+        (Column("Mean", 2, higher_is_better=True), means),
+    ]
+    made = dict.fromkeys(f"{fit['commit']}, {fit['day']}, {fit['machine']}" for fit in own)
+    note = f"Commit, day, machine: {'; '.join(made)}."
+    return table_of(f"Mean PSNR of validation frames, dB; {limits}", columns, [note])
+
+
+#: What writes each block, by the first word of its name; further words are arguments.
+BLOCKS: Mapping[str, Callable[..., Block]] = {
     "headline": _headline,
     "field": _field,
     "ratios": _ratios,
@@ -436,16 +447,17 @@ def make_pages(root: Path) -> dict[Path, str | Callable[[], bytes]]:
     blocks: dict[str, Block] = {}
     for page in pages_of(root):
         text = page.read_text("utf-8")
-        for name in _BLOCK.findall(text):
-            if name[0] not in BLOCKS:
-                problem = f"{name[0]!r} is not a block of results"
+        names = [found[1] for found in _BLOCK.finditer(text)]
+        for name in names:
+            kind, *words = name.split()
+            if kind not in BLOCKS:
+                problem = f"{kind!r} is not a block of results"
                 remedy = f"Known: {', '.join(BLOCKS)}."
                 raise UsageError(problem, where=page, field="results", remedy=remedy)
-            if name[0] not in blocks:
-                blocks[name[0]] = BLOCKS[name[0]](sources)
-        if not _BLOCK.search(text):
-            continue
-        made[page] = _BLOCK.sub(lambda found: _filled(found[1], blocks), text)
+            if name not in blocks:
+                blocks[name] = BLOCKS[kind](sources, *words)
+        if names:
+            made[page] = _BLOCK.sub(lambda found: _filled(found[1], blocks), text)
     for block in blocks.values():
         made |= {root / path: draw for path, draw in block.pictures.items()}
     return made

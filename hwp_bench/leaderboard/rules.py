@@ -329,21 +329,22 @@ def check_names(entries: Iterable[Entry], listed: frozenset[str]) -> None:
 
 
 @cache
-def _manifests() -> list[MethodManifest]:
+def shipped_manifests() -> list[MethodManifest]:
+    """The methods that ship, read once."""
     return shipped_methods()
 
 
 @cache
 def _declared() -> dict[str, TrainingData]:
     """The training data that methods that ship declare, by their digests."""
-    return {manifest.digest: manifest.training for manifest in _manifests()}
+    return {manifest.digest: manifest.training for manifest in shipped_manifests()}
 
 
 @cache
 def _shipped() -> dict[str, str]:
     """Names of methods by their names and titles, as these look."""
     found: dict[str, str] = {}
-    for manifest in _manifests():
+    for manifest in shipped_manifests():
         found |= {_look(manifest.name): manifest.name, _look(manifest.title): manifest.name}
     return found
 
