@@ -258,7 +258,7 @@ def _sample(
 
 
 def _unseen(avatar: WildGHandAvatar, side: str) -> torch.Tensor:
-    """(N,) 1 for Gaussians of skin that no frame shows, else 0; the page draws them as they face."""
+    """(N,) 1 for Gaussians of skin that no frame shows, else 0; the page asks how they face."""
     model = avatar.model
     zeros = torch.zeros(len(model.rigs[side])).to(model.log_gains)
     return zeros if model.visibility is None else model.visibility.behind(side, zeros)
