@@ -111,11 +111,6 @@ def command_tree() -> Command:
         **_leaves("dev", {"docs-results": "write the results in pages of the documentation"}),
         "leaderboard": Command("keep a board", commands=_leaves("leaderboard", keeping)),
     }
-    dev = {
-        "docs-results": Command(
-            "write the results in pages of the documentation", f"{here}.dev:docs-results"
-        ),
-    }
     return Command(
         "benchmark for hand avatars from perturbed in-the-wild video",
         commands={
