@@ -68,6 +68,7 @@ def test_a_wheel_has_the_two_packages_and_their_data(wheel: Path) -> None:
         f"{data}/baselines/plain/plain_fit/method.py",
         f"{data}/leaderboard/published.json",
         f"{data}/splits/hwp-v1.json",
+        f"{data}/templates/mean/my_method.py",
     ):
         assert name in names
     shipped = {path.relative_to(ROOT).as_posix() for path in _data_files()}

@@ -47,6 +47,25 @@ class Command:
         return module.COMMANDS[name] if name else (module.add_arguments, module.run)
 
 
+def make_tree(
+    summary: str, package: str, parts: Mapping[str, Mapping[str, tuple[str, str]]]
+) -> Command:
+    """Return the commands of a program.
+
+    `parts` has, below each heading of its help, the paths of commands such as `data get`, each with
+    its module in the package and its summary. A group has no module, and comes before what is in it
+    or below the heading "", which the help leaves out.
+    """
+    root = Command(summary, parts={head: tuple(rows) for head, rows in parts.items() if head})
+    for rows in parts.values():
+        for path, (module, text) in rows.items():
+            *above, name = path.split()
+            group = _find(root, " ".join(above))
+            made = Command(text, f"{package}.{module}:{name}" if module else "")
+            group.commands.setdefault(name, made)
+    return root
+
+
 #: Exit status where nobody reads standard output any more, as that of a program which SIGPIPE ends.
 _READER_GONE = 128 + 13
 
@@ -210,19 +229,23 @@ The script holds every command and option of this version; print it again after 
 """
 
 
-def add_shell_argument(parser: argparse.ArgumentParser, program: str) -> None:
-    """Add the arguments of the command to a program's parser."""
-    parser.epilog = _COMPLETION_EXAMPLES.replace("{program}", program)
-    parser.add_argument("shell", choices=SHELLS, metavar="SHELL", help=f"{', '.join(SHELLS)}")
+def complete(program: str, package: str) -> tuple[AddArguments, Run]:
+    """Return the command `completion` of a program, whose commands are those of `package.main`."""
 
+    def add_arguments(parser: argparse.ArgumentParser) -> None:
+        parser.epilog = _COMPLETION_EXAMPLES.replace("{program}", program)
+        parser.add_argument("shell", choices=SHELLS, metavar="SHELL", help=f"{', '.join(SHELLS)}")
 
-def completion_script(program: str, tree: Command, shell: str) -> str:
-    """Return the script that completes a program's command line in a shell."""
-    import shtab
+    def run(args: argparse.Namespace) -> int:
+        import shtab
 
-    parser = whole_parser(program, tree)
-    _complete_files(parser)
-    return shtab.complete(parser, shell=shell)
+        tree = importlib.import_module(f"{package}.main").command_tree()
+        parser = whole_parser(program, tree)
+        _complete_files(parser)
+        print(shtab.complete(parser, shell=args.shell))
+        return 0
+
+    return add_arguments, run
 
 
 def _fill(parser: argparse.ArgumentParser, program: str, group: Command) -> None:

@@ -10,7 +10,7 @@ from hwp_bench.base.console import notice
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.tables import Table, print_table, to_object
 from hwp_bench.cli.options import add_json, named_table, print_json
-from hwp_bench.cli.program import add_shell_argument, completion_script
+from hwp_bench.cli.program import complete
 from hwp_bench.taxonomy import PERTURBATIONS, SUITES, catalogue, perturbation
 
 if TYPE_CHECKING:
@@ -236,20 +236,9 @@ def _check_backends(cases: list[Case], asked: list[str]) -> None:
             )
 
 
-def _add_completion(parser: argparse.ArgumentParser) -> None:
-    add_shell_argument(parser, "hwp-bench")
-
-
-def _completion(args: argparse.Namespace) -> int:
-    from hwp_bench.cli.main import command_tree
-
-    print(completion_script("hwp-bench", command_tree(), args.shell))
-    return 0
-
-
 #: The arguments and the work of each command, where `main` looks for them.
 COMMANDS = {
     "list": (_add_list, _list),
     "stability": (_add_stability, _stability),
-    "completion": (_add_completion, _completion),
+    "completion": complete("hwp-bench", "hwp_bench.cli"),
 }

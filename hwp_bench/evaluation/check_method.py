@@ -5,6 +5,7 @@ Scores are not looked at. What a method may be is said in `hwp_bench.methods.con
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections.abc import Iterator, Sequence
@@ -21,7 +22,7 @@ from hwp_bench.capture.schema import frame_name
 from hwp_bench.capture.splits import Split
 from hwp_bench.evaluation.capture_evaluation import EvaluationSettings
 from hwp_bench.evaluation.evaluate import make_plan, with_setting_files
-from hwp_bench.evaluation.scoring import Target, colour_warnings, read_predictions, read_targets
+from hwp_bench.evaluation.scoring import colour_warnings, read_predictions, read_targets
 from hwp_bench.methods.contract import Budget
 from hwp_bench.methods.manifest import check_settings, read_manifest
 from hwp_bench.methods.request import write_request
@@ -51,6 +52,8 @@ _REMEDIES = {
     "shape": "Return (H, W, 3) of the camera that `render` is given.",
     "range": "Return sRGB colour from 0 to 1; what is beyond it is clipped.",
     "nan": "Look for a division by zero, such as the mean of a mask without a pixel.",
+    "speed": "Stop when `report.elapsed` is `budget.seconds`, and after `budget.steps`.",
+    "memory": "Other machines may have less.",
     "missing": "Write predictions/000123.png for every frame of `split.test` in request.json.",
     "network": "An evaluation has no network: put files into the method's folder, or name them "
     "with --expose.",
@@ -122,71 +125,64 @@ def _failure(error: HwpError, name: str, output: Path) -> Finding:
 
 
 def _heard(output: Path, name: str) -> Iterator[Finding]:
-    """What the run found wrong itself, and what the method printed of a network."""
+    """Read the findings of the run, and look for failed calls to the network in its log."""
     try:
         found = read_findings(output / FINDINGS)
     except HwpError as error:
         # The method can write there, too.
         yield Finding("error", name, "run", f"left a {FINDINGS} of its own: {error.problem}")
-        found = []
-    for one in found:
-        more = f" and {one.count - len(one.places)} more" if one.count > len(one.places) else ""
-        where = f"{name}: {', '.join(one.places)}{more}"
-        yield Finding("error", where, one.check, one.problem, _REMEDIES.get(one.check))
+        found = {}
+    for check, (problem, *places) in found.items():
+        where = f"{name}: {', '.join(places)}"
+        yield Finding("error", where, check, problem, _REMEDIES.get(check))
     lines = [line for line in last_lines(output / LOG) if _NO_NETWORK.search(line)]
-    if lines and all(one.check != "network" for one in found):
+    if lines and "network" not in found:
         problem = f"the method printed: {lines[-1]}"
         yield Finding("error", name, "network", problem, _REMEDIES["network"])
 
 
 def _slow(record: RunRecord, name: str, frames: int, budget: Budget) -> Iterator[Finding]:
-    """What costs more than a budget or a person's patience: warnings, because it is scored."""
+    """Warn where a run takes more than its budget, or more time or memory than is usual."""
     facts = record.facts
     seconds = facts.fit_seconds or record.wall_seconds
+    picture, memory = (facts.render_seconds or 0) / frames, facts.peak_memory or 0
+    found = {}
     if budget.seconds is not None and seconds > budget.seconds * _GRACE + _GRACE_SECONDS:
-        problem = f"the fit took {seconds:.1f} s, and its budget is {budget.seconds:g} s"
-        remedy = "Stop when `report.elapsed` reaches `budget.seconds`."
-        yield Finding("warning", name, "speed", problem, remedy)
-    if facts.steps is not None and budget.steps is not None and facts.steps > budget.steps:
-        problem = f"the fit took {facts.steps} steps, and its budget is {budget.steps}"
-        yield Finding("warning", name, "speed", problem, "Stop at `budget.steps`.")
-    if facts.render_seconds is not None and facts.render_seconds / frames > _SLOW_PICTURE:
-        problem = f"a picture takes {facts.render_seconds / frames:.1f} s"
-        yield Finding("warning", name, "speed", problem, "`mini` has 48 test frames, `full` 1,400.")
-    if (facts.peak_memory or 0) > _MUCH_MEMORY:
-        problem = f"the process took {facts.peak_memory / 1e9:.1f} GB of memory"
-        yield Finding("warning", name, "memory", problem, "Other machines may have less.")
+        found[f"the fit took {seconds:.1f} s, and its budget is {budget.seconds:g} s"] = "speed"
+    if (facts.steps or 0) > (budget.steps or math.inf):
+        found[f"the fit took {facts.steps} steps, and its budget is {budget.steps}"] = "speed"
+    if picture > _SLOW_PICTURE:
+        found[f"a picture takes {picture:.1f} s, and `mini` has 48, `full` 1,400"] = "speed"
+    if memory > _MUCH_MEMORY:
+        found[f"the process took {memory / 1e9:.1f} GB of memory"] = "memory"
+    for problem, check in found.items():
+        yield Finding("warning", name, check, problem, _REMEDIES[check])
 
 
 def _pictures(
     record: RunRecord, capture: Capture, split: Split, *, colours: bool
 ) -> Iterator[Finding]:
-    """What is wrong with the pictures that were written, and with their `colours`."""
+    """Look at the pictures that were written and, if asked for, at their `colours`."""
     name, clip = capture.info.id, capture.free_view
-    targets = read_targets(capture, split.test.tolist())
-    yield from _frames(name, targets, record.predictions, capture.size, colours)
+    parts = [(name, read_targets(capture, split.test.tolist()), record.predictions)]
     if clip is not None and record.free_view is not None:
         views = read_targets(clip, range(len(clip)))
-        yield from _frames(f"{name}, free view", views, record.free_view, clip.size, colours)
-
-
-def _frames(
-    name: str, targets: Sequence[Target], folder: Path, size: tuple[int, int], colours: bool
-) -> Iterator[Finding]:
-    predictions = read_predictions(folder, [target.frame for target in targets], size)
-    bad: dict[tuple[str, str], list[int]] = {}
-    for one in predictions:
-        if one.failure is not None:
-            reason = one.failure.partition(": ")[2]
-            check = "image" if (folder / frame_name(one.frame)).exists() else "missing"
-            check = "shape" if "is expected" in reason and "pixels" in reason else check
-            bad.setdefault((check, reason), []).append(one.frame)
-    for (check, reason), frames in bad.items():
-        where, count = f"{name}: frames {bounded(frames)}", f"{len(frames)} of {len(targets)}"
-        problem = f"{count} pictures: {reason}"
-        yield Finding("error", where, check, problem, _REMEDIES.get(check))
-    for text in colour_warnings(targets, predictions) if colours else ():
-        yield Finding("error", name, "range", text, _REMEDIES["range"])
+        parts.append((f"{name}, free view", views, record.free_view))
+    for place, targets, folder in parts:
+        predictions = read_predictions(folder, [one.frame for one in targets], capture.size)
+        bad: dict[tuple[str, str], list[int]] = {}
+        for one in predictions:
+            if one.failure is not None:
+                reason = one.failure.partition(": ")[2]
+                check = "image" if (folder / frame_name(one.frame)).exists() else "missing"
+                check = "shape" if "pixels where" in reason else check
+                bad.setdefault((check, reason), []).append(one.frame)
+        for (check, reason), frames in bad.items():
+            problem = f"{len(frames)} of {len(targets)} pictures: {reason}"
+            where = f"{place}: frames {bounded(frames)}"
+            yield Finding("error", where, check, problem, _REMEDIES.get(check))
+        for text in colour_warnings(targets, predictions) if colours else ():
+            yield Finding("error", place, "range", text, _REMEDIES["range"])
 
 
 def _facts(record: RunRecord, capture: Capture, split: Split) -> dict[str, Any]:

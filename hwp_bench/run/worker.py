@@ -49,7 +49,7 @@ PROGRESS = "progress.json"
 FAILURE = "failure.json"
 #: The method's printed output.
 LOG = "log.txt"
-#: What a run with `--check` found wrong.
+#: Findings of a run with `--check`.
 FINDINGS = "findings.json"
 #: Settings and seed of a method that is only made, in the place of a request.
 REHEARSAL = "rehearsal.json"
@@ -100,7 +100,7 @@ def main(arguments: list[str] | None = None) -> int:
         status = 130 if isinstance(error, KeyboardInterrupt) else 1
     finally:
         if watch is not None:
-            write_json(args.output / FINDINGS, [asdict(one) for one in watch.found.values()])
+            write_json(args.output / FINDINGS, {"found": watch.found})
     # For the runner; a full disc takes the reason from nobody else.
     with contextlib.suppress(HwpError, ValueError):
         # A message may hold what no file of Unicode can.
@@ -221,31 +221,17 @@ def _fault(image: np.ndarray, camera: Camera) -> tuple[str, str] | None:
 # --- a run that is checked: it continues where a picture cannot be taken
 
 
-@dataclass
-class RunFinding:
-    """One kind of thing that a checked run found wrong."""
-
-    #: What is wrong in a word.
-    check: Line
-    #: The sentence of the first place.
-    problem: Line
-    #: How many places there are, and the first of them.
-    count: Count = 0
-    places: Annotated[list[Line], Meta(max_length=MAX_PLACES)] = field(default_factory=list)
-
-
 class Watch:
     """Collects what is wrong with pictures, and looks for calls to the network."""
 
     def __init__(self) -> None:
-        self.found: dict[str, RunFinding] = {}
+        self.found: dict[str, list[str]] = {}
 
     def note(self, check: str, problem: str, place: str) -> None:
-        """Add a place to what is found."""
-        finding = self.found.setdefault(check, RunFinding(check, one_line(problem, 500)))
-        finding.count += 1
-        if len(finding.places) < MAX_PLACES:
-            finding.places.append(one_line(place, 200))
+        """Add a place to what is found: a sentence by its word, then the first places."""
+        found = self.found.setdefault(check, [one_line(problem, 500)])
+        if len(found) <= MAX_PLACES:
+            found.append(one_line(place, 200))
 
     def hear(self, event: str, arguments: tuple[Any, ...]) -> None:
         """Note an audit event of Python that asks for another machine."""
@@ -280,20 +266,22 @@ class Watch:
         return as_uint8(colours)
 
 
-def read_findings(path: Path) -> list[RunFinding]:
-    """Read what a checked run found; nothing where it was killed before, or ran unchecked."""
-    if not path.is_file():
-        return []
-    value = {"found": read_json(path, max_bytes=MAX_BYTES)}
-    listed = parse_record(_Findings, value, where=path)
-    return listed.found
-
-
 @dataclass(frozen=True)
 class _Findings:
-    """The content of the file."""
+    """The content of the file of findings."""
 
-    found: Annotated[list[RunFinding], Meta(max_length=MAX_FRAMES)]
+    found: dict[Line, Annotated[list[Line], Meta(min_length=1, max_length=MAX_PLACES + 1)]]
+
+
+def read_findings(path: Path) -> dict[str, list[str]]:
+    """Read what a checked run found: a sentence and the first places, by a word for what is wrong.
+
+    There is nothing where the run was killed before, or was not checked.
+    """
+    if not path.is_file():
+        return {}
+    value = read_json(path, max_bytes=MAX_BYTES)
+    return parse_record(_Findings, value, where=path).found
 
 
 # --- the clock and its checkpoints

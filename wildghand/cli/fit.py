@@ -54,8 +54,7 @@ GPU of its own.
 """
 
 
-def add_fit(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
+def _add_fit(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _FIT_EXAMPLES
     add = parser.add_argument
     add("source", type=Path, metavar="VIDEO|CAPTURE", help="what to fit")
@@ -82,7 +81,7 @@ def add_fit(parser: argparse.ArgumentParser) -> None:
     add_ending(parser, "avatar")
 
 
-def do_fit(args: argparse.Namespace) -> int:
+def _do_fit(args: argparse.Namespace) -> int:
     """Run the command, in one process or in those that torchrun started."""
     from hwp_bench.base.files import check_places
     from wildghand.fitting.parallel import run_in_world
@@ -213,8 +212,7 @@ stopped run continues when the same command is given again.
 """
 
 
-def add_pretrain(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
+def _add_pretrain(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _PRETRAIN_EXAMPLES
     add = parser.add_argument
     add("captures", type=Path, nargs="+", metavar="CAPTURE", help="what to fit jointly")
@@ -224,8 +222,7 @@ def add_pretrain(parser: argparse.ArgumentParser) -> None:
     add_ending(parser, "prior")
 
 
-def do_pretrain(args: argparse.Namespace) -> int:
-    """Run the command."""
+def _do_pretrain(args: argparse.Namespace) -> int:
     from hwp_bench.base.files import check_places
     from wildghand.pretrain.pretrain import pretrain
     from wildghand.prior.prior import WEIGHTS
@@ -254,6 +251,6 @@ def do_pretrain(args: argparse.Namespace) -> int:
 
 #: What adds the arguments of a command, and what runs it and returns the status.
 COMMANDS = {
-    "fit": (add_fit, do_fit),
-    "pretrain": (add_pretrain, do_pretrain),
+    "fit": (_add_fit, _do_fit),
+    "pretrain": (_add_pretrain, _do_pretrain),
 }

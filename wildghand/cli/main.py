@@ -5,37 +5,33 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from hwp_bench.cli.program import Command, run_program
+from hwp_bench.cli.program import Command, make_tree, run_program
+
+#: Every command below its heading in `--help`: its module in `wildghand/cli`, and what it does.
+_COMMANDS = {
+    "avatar": {
+        "fit": ("fit", "fit an avatar to a capture or a video"),
+        "view": ("show", "pose an avatar in the browser"),
+        "page": ("show", "write an avatar as a page for browsers, one file"),
+        "render": ("show", "draw an avatar along the poses of a capture"),
+        "export": ("show", "write an avatar as Gaussians for viewers"),
+    },
+    "study": {
+        "judge": ("study", "judge the frames of a capture: clean or perturbed"),
+        "explain": ("study", "show what the biases took out of training frames"),
+        "stage": ("show", "draw an avatar and its cameras in 3D"),
+        "pretrain": ("fit", "fit one network to several captures, as a prior for fits"),
+    },
+    "other": {
+        "info": ("study", "print versions and check what draws on this machine"),
+        "completion": ("study", "print completion for a shell"),
+    },
+}
 
 
 def command_tree() -> Command:
     """Return every command of `wildghand`."""
-    fit, show, study = (f"wildghand.cli.{topic}" for topic in ("fit", "show", "study"))
-    return Command(
-        "anti-perturbation Gaussian hand avatars",
-        commands={
-            "fit": Command("fit an avatar to a capture or a video", f"{fit}:fit"),
-            "pretrain": Command(
-                "fit one network to several captures, as a prior for fits", f"{fit}:pretrain"
-            ),
-            "render": Command("draw an avatar along the poses of a capture", f"{show}:render"),
-            "view": Command("pose an avatar in the browser", f"{show}:view"),
-            "export": Command("write an avatar as Gaussians for viewers", f"{show}:export"),
-            "page": Command("write an avatar as a page for browsers, one file", f"{show}:page"),
-            "stage": Command("draw an avatar and its cameras in 3D", f"{show}:stage"),
-            "judge": Command("judge the frames of a capture: clean or perturbed", f"{study}:judge"),
-            "explain": Command(
-                "show what the biases took out of training frames", f"{study}:explain"
-            ),
-            "completion": Command("print completion for a shell", f"{study}:completion"),
-            "info": Command("print versions and check what draws on this machine", f"{study}:info"),
-        },
-        parts={
-            "avatar": ("fit", "view", "page", "render", "export"),
-            "study": ("judge", "explain", "stage", "pretrain"),
-            "other": ("info", "completion"),
-        },
-    )
+    return make_tree("anti-perturbation Gaussian hand avatars", "wildghand.cli", _COMMANDS)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -30,8 +30,7 @@ The poses are those of a capture: its hand parameters and cameras. PNG files are
 """
 
 
-def add_render(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
+def _add_render(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _RENDER_EXAMPLES
     add = parser.add_argument
     add_avatar(parser)
@@ -43,8 +42,7 @@ def add_render(parser: argparse.ArgumentParser) -> None:
     add_ending(parser, "folder")
 
 
-def do_render(args: argparse.Namespace) -> int:
-    """Run the command."""
+def _do_render(args: argparse.Namespace) -> int:
     from hwp_bench.capture import open_capture
     from wildghand.avatar.render import render_clip
 
@@ -89,8 +87,7 @@ viser: pip install 'hwp-bench[view]'.
 """
 
 
-def add_view(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
+def _add_view(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _VIEW_EXAMPLES
     add = parser.add_argument
     add_avatar(parser)
@@ -107,7 +104,7 @@ def add_view(parser: argparse.ArgumentParser) -> None:
     add_json(parser)
 
 
-def do_view(args: argparse.Namespace) -> int:
+def _do_view(args: argparse.Namespace) -> int:
     """Run the command; Ctrl-C ends it with status 0."""
     import threading
 
@@ -148,8 +145,7 @@ makes them; docs/export.md says how it is saved.
 """
 
 
-def add_export(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
+def _add_export(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EXPORT_EXAMPLES
     add = parser.add_argument
     add_avatar(parser)
@@ -172,8 +168,7 @@ def add_export(parser: argparse.ArgumentParser) -> None:
     add_ending(parser, "file")
 
 
-def do_export(args: argparse.Namespace) -> int:
-    """Run the command."""
+def _do_export(args: argparse.Namespace) -> int:
     from wildghand.export.formats import ExportSettings, check_target, export, export_gaussians
 
     names = (item.name for item in dataclasses.fields(ExportSettings))
@@ -213,8 +208,7 @@ side: the camera of the frame is red, others are grey. It needs no display.
 """
 
 
-def add_stage(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
+def _add_stage(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _STAGE_EXAMPLES
     add_avatar(parser)
     add_poses(parser, "capture with the pose and the cameras (default: what a fit of a video left)")
@@ -225,8 +219,7 @@ def add_stage(parser: argparse.ArgumentParser) -> None:
     add_ending(parser, "file")
 
 
-def do_stage(args: argparse.Namespace) -> int:
-    """Run the command."""
+def _do_stage(args: argparse.Namespace) -> int:
     from hwp_bench.capture import open_capture
     from wildghand.viewer.posed_view import capture_of
     from wildghand.viewer.stage import draw_stage
@@ -256,8 +249,7 @@ With the capture that was fitted its motion is played, too.
 """
 
 
-def add_page(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
+def _add_page(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _PAGE_EXAMPLES
     add_avatar(parser)
     out, text = Path("avatar.html"), "file to write (default: avatar.html)"
@@ -268,8 +260,7 @@ def add_page(parser: argparse.ArgumentParser) -> None:
     add_ending(parser, "file")
 
 
-def do_page(args: argparse.Namespace) -> int:
-    """Run the command."""
+def _do_page(args: argparse.Namespace) -> int:
     from hwp_bench.capture import open_capture
     from wildghand.page import write_page
     from wildghand.viewer.posed_view import capture_of
@@ -289,9 +280,9 @@ def do_page(args: argparse.Namespace) -> int:
 
 #: What adds the arguments of a command, and what runs it and returns the status.
 COMMANDS = {
-    "render": (add_render, do_render),
-    "view": (add_view, do_view),
-    "export": (add_export, do_export),
-    "page": (add_page, do_page),
-    "stage": (add_stage, do_stage),
+    "render": (_add_render, _do_render),
+    "view": (_add_view, _do_view),
+    "export": (_add_export, _do_export),
+    "page": (_add_page, _do_page),
+    "stage": (_add_stage, _do_stage),
 }

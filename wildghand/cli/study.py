@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from hwp_bench.base.files import check_places
 from hwp_bench.cli.options import add_json, print_json
-from hwp_bench.cli.program import add_shell_argument
+from hwp_bench.cli.program import complete
 from wildghand.cli.options import add_avatar, avatar_of
 
 if TYPE_CHECKING:
@@ -30,8 +30,7 @@ capture is not changed.
 """
 
 
-def add_judge(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
+def _add_judge(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _JUDGE_EXAMPLES
     add = parser.add_argument
     add("capture", type=Path, help="capture folder")
@@ -40,8 +39,7 @@ def add_judge(parser: argparse.ArgumentParser) -> None:
     add_json(parser)
 
 
-def do_judge(args: argparse.Namespace) -> int:
-    """Run the command."""
+def _do_judge(args: argparse.Namespace) -> int:
     import numpy as np
 
     from hwp_bench.base.console import track
@@ -126,8 +124,7 @@ the capture says it: DPD disentangles what it should where the correlation is hi
 """
 
 
-def add_explain(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
+def _add_explain(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EXPLAIN_EXAMPLES
     add = parser.add_argument
     add_avatar(parser)
@@ -137,8 +134,7 @@ def add_explain(parser: argparse.ArgumentParser) -> None:
     add("--frames", type=int, nargs="+", action="extend", metavar="N", help=text)
 
 
-def do_explain(args: argparse.Namespace) -> int:
-    """Run the command."""
+def _do_explain(args: argparse.Namespace) -> int:
     from hwp_bench.base.images import write_image
     from hwp_bench.capture import open_capture
     from wildghand.avatar.render import explain_frames, explanation_sheet, temporal_weights
@@ -178,16 +174,14 @@ With --network it lists the parameters of the prediction network for two hands i
 TOLERANCE = 1e-4
 
 
-def add_info(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
+def _add_info(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _INFO_EXAMPLES
     sizes, text = ("compact", "paper"), "list the parameters of the network"
     parser.add_argument("--network", choices=sizes, help=text)
     add_json(parser)
 
 
-def do_info(args: argparse.Namespace) -> int:
-    """Run the command."""
+def _do_info(args: argparse.Namespace) -> int:
     if args.network:
         _print_network(args.network, args.json)
         return 0
@@ -270,24 +264,10 @@ def _check(backend: str) -> dict[str, Any]:
     return {"backend": backend, "state": state, "largest_error": largest}
 
 
-def add_completion(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
-    add_shell_argument(parser, "wildghand")
-
-
-def do_completion(args: argparse.Namespace) -> int:
-    """Run the command."""
-    from hwp_bench.cli.program import completion_script
-    from wildghand.cli.main import command_tree
-
-    print(completion_script("wildghand", command_tree(), args.shell))
-    return 0
-
-
 #: What adds the arguments of a command, and what runs it and returns the status.
 COMMANDS = {
-    "judge": (add_judge, do_judge),
-    "explain": (add_explain, do_explain),
-    "info": (add_info, do_info),
-    "completion": (add_completion, do_completion),
+    "judge": (_add_judge, _do_judge),
+    "explain": (_add_explain, _do_explain),
+    "info": (_add_info, _do_info),
+    "completion": complete("wildghand", "wildghand.cli"),
 }

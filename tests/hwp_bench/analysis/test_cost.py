@@ -156,16 +156,16 @@ def test_the_band_is_students_interval_over_captures() -> None:
 
 def test_the_plain_baseline_is_the_reference_where_it_is_there() -> None:
     runs = group_runs([doubling("mine"), doubling("plain", 19.0, 4)])
-    heads = [column.title for column in analyse_cost(runs, "psnr").tables["curves"].columns]
+    heads = [column.title for column in analyse_cost(runs, "psnr").tables["cost"].columns]
     assert "To final of Plain" in heads
-    heads = [column.title for column in analyse_cost(runs[:1], "psnr").tables["curves"].columns]
+    heads = [column.title for column in analyse_cost(runs[:1], "psnr").tables["cost"].columns]
     assert not any(title.startswith("To final") for title in heads)
 
 
 def test_failed_fits_and_other_machines_are_named() -> None:
     other = doubling("plain", environment={"processor": "fast", "cores": 64})
     lost = replace(other, captures=[replace(other.captures[0], curve=[]), *other.captures[1:]])
-    notes = analyse_cost(group_runs([doubling("mine"), lost]), "psnr").tables["curves"].notes
+    notes = analyse_cost(group_runs([doubling("mine"), lost]), "psnr").tables["cost"].notes
     assert "Fits without a curve, left out: Plain: 1." in notes
     assert any("the seconds do not compare" in note for note in notes)
 

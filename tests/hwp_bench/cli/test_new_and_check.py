@@ -255,7 +255,7 @@ def test_findings_of_a_methods_own_are_not_believed(both: Capture, tmp_path: Pat
     method = write_manifest(tmp_path / "m", "m", SCRIPT)
     (method / "run.py").write_text(script)
     assert "findings.json" in faults(method, both, settings())["run"].problem
-    assert read_findings(tmp_path / "nowhere.json") == []
+    assert read_findings(tmp_path / "nowhere.json") == {}
 
 
 @pytest.mark.parametrize(
