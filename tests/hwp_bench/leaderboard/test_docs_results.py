@@ -216,7 +216,7 @@ def test_a_folder_of_methods_and_seeds_is_added_in_one_call(
         place = runs / one.method.name / f"seed-{one.seed}"
         place.mkdir(parents=True)
         write_results(place / "results.json", one)
-    words = ["leaderboard", "add", str(runs), "--entries", str(entries)]
+    words = ["dev", "leaderboard", "add", str(runs), "--entries", str(entries)]
     assert main(words) == 0
     assert len(list(entries.glob("*.json"))) == len(made)
     before = {file.name: file.read_bytes() for file in entries.glob("*.json")}
