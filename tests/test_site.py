@@ -96,6 +96,18 @@ def test_the_workflow_runs_the_ci_script_and_hooks_are_the_project_s_own() -> No
     assert {repo["repo"] for repo in hooks["repos"]} == {"local"}
 
 
+def test_the_site_is_published_and_problems_come_with_facts() -> None:
+    github = ROOT / ".github"
+    workflow = yaml.safe_load((github / "workflows" / "docs.yml").read_text("utf-8"))
+    steps = workflow["jobs"]["publish"]["steps"]
+    assert "python -m tools.docs_site build" in [step.get("run") for step in steps]
+    assert {"path": "build/site"} in [step.get("with") for step in steps]
+    for name in ("problem", "result"):
+        form = yaml.safe_load((github / "ISSUE_TEMPLATE" / f"{name}.yml").read_text("utf-8"))
+        asked = [part["attributes"].get("label", "") for part in form["body"]]
+        assert "Output of `wildghand info`" in asked
+
+
 def test_citation_and_changelog_name_the_version() -> None:
     from hwp_bench import __version__
 

@@ -18,10 +18,11 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import redirect_stdout
+from contextlib import redirect_stdout, suppress
 from io import StringIO
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
+from unittest import mock
 
 from griffe import Attribute, Docstring, Extension
 
@@ -174,12 +175,8 @@ def _leaves(tree: Command) -> Iterator[list[str]]:
 def _printed(run: Callable[[list[str]], int], words: list[str]) -> str:
     """Return what a command prints on a console of 90 columns."""
     out = StringIO()
-    os.environ["COLUMNS"] = "90"
-    try:
-        with redirect_stdout(out):
-            run(words)
-    except SystemExit:
-        pass
+    with mock.patch.dict(os.environ, COLUMNS="90"), redirect_stdout(out), suppress(SystemExit):
+        run(words)
     return out.getvalue().strip("\n")
 
 
