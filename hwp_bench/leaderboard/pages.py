@@ -81,11 +81,7 @@ class Field:
         """`OURS` less each other method in the macro mean of `METRIC`, by the name of its row."""
         found = {}
         for row in self.others if self.ours else ():
-            first, second = (
-                MethodRuns(one.title, {run.seed: run for run in one.compared})
-                for one in (self.ours, row)
-                if one
-            )
+            first, second = (_by_seed(one) for one in (self.ours, row) if one)
             if seeds := sorted(first.seeds.keys() & second.seeds.keys()):
                 terms = (1.0, first), (-1.0, second)
                 found[row.name] = contrasts(terms, METRIC, seeds, only=MACRO)[0].estimate
@@ -102,6 +98,10 @@ class Field:
             best, title = max((means[name], title) for means, title in others)
             found.append((score - best, name, title))
         return sorted(found)
+
+
+def _by_seed(row: BoardRow) -> MethodRuns:
+    return MethodRuns(row.title, {one.seed: one for one in row.compared})
 
 
 def _capture_means(row: BoardRow) -> dict[str, float]:
@@ -435,9 +435,7 @@ def find_faults(root: Path) -> list[str]:
 
 def _key(page: Path) -> str:
     """How a page is called in `TYPED`, wherever it lies below `docs`."""
-    return (
-        f"{page.parent.name}/{page.name}" if page.parent.parent.name == "baselines" else page.name
-    )
+    return f"{page.parent.name}/README.md" if page.match("baselines/*/README.md") else page.name
 
 
 def _without_source(text: str, studies: Path) -> Iterator[tuple[int, str]]:
