@@ -44,6 +44,7 @@ TYPED = "docs/results.toml"
 PICTURES = "docs/pictures/field"
 
 _BLOCK = re.compile(r"^<!-- results: (.+) -->\n(.*?)^<!-- end -->$", re.DOTALL | re.MULTILINE)
+_DIGEST = re.compile(r"<!-- digest: \w{64} -->\s*\Z")
 _DECIBELS = re.compile(r"[-+]?\d[\d.]*(?:(?:,| to| and| or)\s[-+]?\d[\d.]*)*\s+dB\b")
 _STUDY = re.compile(r"\]\((?:\.\./)*(?:docs/)?studies/([\w-]+\.md)")
 
@@ -411,7 +412,8 @@ def find_faults(root: Path) -> list[str]:
 
     A block must be what its source says, and its pictures must be there. A decibel outside of
     the blocks of a page for users must stand in the study that its paragraph leads to, or be listed
-    for the page in `TYPED`: as a definition, or as one that no file says yet.
+    for the page in `TYPED`: as a definition, or as one that no file says yet. A page that another
+    program writes as a whole must have the digest that it left (`with_digest`).
     """
     faults = []
     for file, content in make_pages(root).items():
@@ -423,14 +425,24 @@ def find_faults(root: Path) -> list[str]:
     typed: dict[str, Any] = tomllib.loads((root / TYPED).read_text("utf-8"))
     studies = root / "docs" / "studies"
     for page in pages_of(root):
-        key = _key(page)
-        if page.parent == studies or key in typed["generated"]:
+        key, place = _key(page), page.relative_to(root)
+        if program := typed["generated"].get(key):
+            if page.read_text("utf-8") != with_digest(page.read_text("utf-8")):
+                faults.append(f"{place}: is not as {program} wrote it")
+            continue
+        if page.parent == studies:
             continue
         known = {*typed["definitions"].get(key, ()), *typed["unsourced"].get(key, ())}
         for line, number in _without_source(page.read_text("utf-8"), studies):
             if number not in known:
-                faults.append(f"{page.relative_to(root)}:{line}: {number!r} has no source")
+                faults.append(f"{place}:{line}: {number!r} has no source")
     return faults
+
+
+def with_digest(text: str) -> str:
+    """Return a page with the digest of its text in a comment at the end, in place of an old one."""
+    text = _DIGEST.sub("", text).rstrip()
+    return f"{text}\n\n<!-- digest: {sha256_json(text)} -->\n"
 
 
 def _key(page: Path) -> str:

@@ -13,7 +13,7 @@ from made_entries import complete_results
 from hwp_bench.analysis.bootstrap import Estimate
 from hwp_bench.base.errors import UsageError
 from hwp_bench.cli.main import main
-from hwp_bench.leaderboard.pages import PICTURES, find_faults, verdict_of, write_pages
+from hwp_bench.leaderboard.pages import PICTURES, find_faults, verdict_of, with_digest, write_pages
 from hwp_bench.leaderboard.submit import PLACE, add_entries
 from hwp_bench.results import write_results
 
@@ -187,6 +187,23 @@ def test_a_decibel_outside_of_blocks_needs_a_source(
     assert [fault.split(": ", 1)[1] for fault in found] == [
         f"{one!r} has no source" for one in faults
     ]
+
+
+def test_a_page_that_a_program_wrote_is_as_it_was_written(checkout: Path) -> None:
+    page, typed = checkout / "docs" / "page.md", checkout / "docs" / "results.toml"
+    typed.write_text(TYPED.replace("[def", '"page.md" = "benchmarks/some.py"\n[def'))
+    page.write_text(with_digest("It brings 2.5 dB.\n"))
+    try:
+        assert with_digest(page.read_text()) == page.read_text()
+        assert find_faults(checkout) == []
+        page.write_text(page.read_text().replace("2.5", "2.6"))
+        fault = "docs/page.md: is not as benchmarks/some.py wrote it"
+        assert find_faults(checkout) == [fault]
+        page.write_text("It brings 2.5 dB.\n")
+        assert find_faults(checkout) == [fault]
+    finally:
+        page.unlink()
+        typed.write_text(TYPED)
 
 
 def test_a_wrong_place_and_a_wrong_block_are_refused(tmp_path: Path, checkout: Path) -> None:
