@@ -13,7 +13,14 @@ from made_entries import complete_results
 from hwp_bench.analysis.bootstrap import Estimate
 from hwp_bench.base.errors import UsageError
 from hwp_bench.cli.main import main
-from hwp_bench.leaderboard.pages import PICTURES, find_faults, verdict_of, with_digest, write_pages
+from hwp_bench.leaderboard.pages import (
+    PICTURES,
+    Sources,
+    find_faults,
+    verdict_of,
+    with_digest,
+    write_pages,
+)
 from hwp_bench.leaderboard.submit import PLACE, add_entries
 from hwp_bench.results import write_results
 
@@ -204,6 +211,18 @@ def test_a_page_that_a_program_wrote_is_as_it_was_written(checkout: Path) -> Non
     finally:
         page.unlink()
         typed.write_text(TYPED)
+
+
+def test_suites_that_nothing_was_designed_on_come_first(tmp_path: Path) -> None:
+    names = ("mini", "smoke", "real-1", "wild-test")
+    made = [complete_results("mine", 20.0, suite_name=name) for name in names]
+    add_entries(tmp_path / PLACE, made)
+    assert [one.suite for one in Sources(tmp_path).fields] == [
+        "wild-test",
+        "real-1",
+        "smoke",
+        "mini",
+    ]
 
 
 def test_a_wrong_place_and_a_wrong_block_are_refused(tmp_path: Path, checkout: Path) -> None:
