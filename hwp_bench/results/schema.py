@@ -11,20 +11,23 @@ import math
 import os
 import platform
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import metadata
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from msgspec import Meta
 
 from hwp_bench.base import packages
-from hwp_bench.base.errors import UsageError
+from hwp_bench.base.errors import MissingDependency, UsageError
 from hwp_bench.base.files import canonical_json, files_digest
 from hwp_bench.base.records import Count, Digest, Line, Message, Seconds, Seed
 from hwp_bench.base.tables import Table
 from hwp_bench.metrics import METRICS
 from hwp_bench.metrics.score import CaptureScores, Scores, aggregate
+
+if TYPE_CHECKING:
+    import pandas
 
 #: Largest result file that is read, bytes; one of 10,000 frames stays far below it.
 MAX_BYTES = 64 << 20
@@ -279,6 +282,40 @@ class Results:
         ]
         return f"Results({', '.join(parts)})"
 
+    def to_frame(self, rows: str = "frames") -> pandas.DataFrame:
+        """Return the scores as a table of pandas, to group, join and plot.
+
+        Every row begins with `method`, `suite`, `seed` and `capture`; each metric is a column.
+        Tables of several results are joined by `pandas.concat`.
+
+        Args:
+            rows: `frames`, the test frames; `free-view`, the frames of the free-view clips;
+                `curve`, the checkpoints of the fits with step, seconds and validation scores; or
+                `captures`, the mean over the test frames with seconds, steps and memory.
+
+        Raises:
+            MissingDependency: pandas is not installed.
+            UsageError: there are no such rows.
+        """
+        if rows not in _ROWS:
+            raise UsageError(
+                f"is {str(rows)[:100]!r}", field="rows", remedy=f"Use one of {', '.join(_ROWS)}."
+            )
+        try:
+            import pandas
+        except ImportError as error:
+            raise MissingDependency(
+                "pandas is not installed", remedy="pip install 'hwp-bench[pandas]'"
+            ) from error
+        head = {"method": self.method.title, "suite": self.suite, "seed": self.seed}
+        return pandas.DataFrame(
+            [
+                {**head, "capture": capture.id, **row}
+                for capture in self.captures
+                for row in _ROWS[rows](capture)
+            ]
+        )
+
     @property
     def drawn(self) -> bool:
         """Whether any frame could be scored; where none was, every score is a penalty."""
@@ -299,6 +336,31 @@ class Results:
             for frame in capture.frames:
                 return list(frame.scores)
         return []
+
+
+# --- rows of a table of pandas
+
+
+def _frame_rows(frames: Sequence[FrameResult]) -> list[dict[str, Any]]:
+    return [{"frame": one.frame, **one.scores, "failure": one.failure} for one in frames]
+
+
+def _capture_row(capture: CaptureResult) -> dict[str, Any]:
+    names = ("fit_seconds", "cpu_seconds", "render_seconds", "steps", "peak_memory", "device")
+    frames = [one.scores for one in capture.frames]
+    means = {name: math.fsum(one[name] for one in frames) / len(frames) for name in frames[0]}
+    return {**means, **{name: getattr(capture, name) for name in names}, "failure": capture.failure}
+
+
+#: What `Results.to_frame` can show of a capture, by name.
+_ROWS: dict[str, Callable[[CaptureResult], list[dict[str, Any]]]] = {
+    "frames": lambda capture: _frame_rows(capture.frames),
+    "free-view": lambda capture: _frame_rows(capture.free_view.frames if capture.free_view else []),
+    "curve": lambda capture: [
+        {"step": one.step, "seconds": one.seconds, **one.scores} for one in capture.curve
+    ],
+    "captures": lambda capture: [_capture_row(capture)],
+}
 
 
 # --- bounds, checked before a number is used
