@@ -16,6 +16,7 @@ import numpy as np
 from hwp_bench.analysis.compare import Comparison, compare_results
 from hwp_bench.base.console import JobsView, notice
 from hwp_bench.base.errors import UsageError, of_type, place, whole_number
+from hwp_bench.base.folders import scratch_folder
 from hwp_bench.capture import Capture
 from hwp_bench.evaluation.capture_evaluation import EvaluationSettings
 from hwp_bench.evaluation.evaluate import (
@@ -27,8 +28,9 @@ from hwp_bench.evaluation.evaluate import (
 )
 from hwp_bench.evaluation.evaluate import evaluate as evaluate_method
 from hwp_bench.evaluation.sentences import outcome_lines
-from hwp_bench.methods.contract import RunSettings
+from hwp_bench.methods.contract import MethodFactory, RunSettings
 from hwp_bench.methods.manifest import find_method, read_manifest
+from hwp_bench.methods.source import write_method
 from hwp_bench.metrics.score import score_frame
 from hwp_bench.report.tables import HEADLINE
 from hwp_bench.results import Results, read_all
@@ -44,7 +46,7 @@ Captures: TypeAlias = (
 
 
 def evaluate(
-    method: str | os.PathLike[str],
+    method: str | os.PathLike[str] | MethodFactory,
     captures: Captures = "mini",
     out: str | os.PathLike[str] | None = None,
     *,
@@ -63,7 +65,11 @@ def evaluate(
     are. Before the first capture the method is made once with its settings.
 
     Args:
-        method: method directory, or the name of one that ships: `plain`, `wildghand`.
+        method: method directory; the name of one that ships (`plain`, `wildghand`) or that is
+            installed; or a class or function that is called with `settings` and `seed` and returns
+            a `hwp_bench.methods.Method`. Its source, with what it uses of its own file or
+            notebook, becomes a method directory for this call: it runs in a process of its own and
+            sees none of the variables that are set elsewhere.
         captures: a suite (`smoke`, `mini`, `full`, `wild-dev`, `persistent`, `real-1`; rendered
             or imported on first use), a capture or its folder, or a list of these.
         out: results folder; `runs/METHOD-SUITE` if None, with the oracle's name, the budget and
@@ -91,6 +97,21 @@ def evaluate(
             lies in the method or in a capture, or holds results of another evaluation.
         HwpError: another evaluation is writing to `out`, or `out` cannot be written.
     """
+    if callable(method):
+        with scratch_folder("hwp-method-") as scratch:
+            return evaluate(
+                write_method(method, scratch),
+                captures,
+                out,
+                preset=preset,
+                settings=settings,
+                seed=seed,
+                seconds=seconds,
+                steps=steps,
+                frames=frames,
+                jobs=jobs,
+                overwrite=overwrite,
+            )
     method = os.fspath(place(method, "method"))
     suite = captures if isinstance(captures, str) and captures in SUITES else "captures"
     given = _folders(captures) if suite == "captures" else []
