@@ -79,6 +79,8 @@ def add_fit(parser: argparse.ArgumentParser) -> None:
     live = "show the fit in the browser while it runs (needs viser); changes nothing of it"
     add("--live", action="store_true", help=live)
     add_address(parser)
+    log = "write curves and pictures of the fit for TensorBoard (needs tensorboard)"
+    add("--tensorboard", type=Path, metavar="DIR", help=log)
     add_ending(parser, "avatar")
 
 
@@ -97,6 +99,7 @@ def do_fit(args: argparse.Namespace) -> int:
         "--prior": args.prior,
     }
     check_places({"--out": args.out}, inputs, replaces=args.overwrite)
+    check_places({"--tensorboard": args.tensorboard}, inputs)
     work = _video if is_video(args.source) else _capture
     return run_in_world(
         lambda: choose_device(read_settings(_settings(args)).device),
@@ -105,6 +108,7 @@ def do_fit(args: argparse.Namespace) -> int:
 
 
 def _video(args: argparse.Namespace, world: World) -> int:
+    from wildghand.fitting.tensorboard import logging_fit
     from wildghand.from_video import VideoFit, make_avatar
 
     options = VideoFit(
@@ -119,14 +123,17 @@ def _video(args: argparse.Namespace, world: World) -> int:
         seed=args.seed,
         settings=_settings(args),
     )
-    with watching(args, shown=args.live and world.is_main) as served:
+    with (
+        watching(args, shown=args.live and world.is_main) as served,
+        logging_fit(_log(args, world), None if served is None else served.watch) as watch,
+    ):
         made = make_avatar(
             args.source,
             args.out,
             options,
             overwrite=args.overwrite,
             world=world,
-            watch=None if served is None else served.watch,
+            watch=watch,
             glimpse=None if served is None else served.glimpse,
         )
     if world.is_main:
@@ -153,6 +160,7 @@ def _capture(args: argparse.Namespace, world: World) -> int:
     from hwp_bench.base.errors import UsageError
     from hwp_bench.methods.contract import Budget
     from wildghand.fitting.session import fit_capture
+    from wildghand.fitting.tensorboard import logging_fit
     from wildghand.from_video.run import with_quick
 
     for option in ("side", "landmarks", "model", "hand-model"):
@@ -165,7 +173,10 @@ def _capture(args: argparse.Namespace, world: World) -> int:
     if args.seconds is not None and not args.seconds > 0.0:
         raise UsageError(f"is {args.seconds}", field="--seconds", remedy="Use more than 0.")
     check_fitting(args)
-    with watching(args, shown=args.live and world.is_main) as served:
+    with (
+        watching(args, shown=args.live and world.is_main) as served,
+        logging_fit(_log(args, world), None if served is None else served.watch) as watch,
+    ):
         avatar = fit_capture(
             args.source,
             args.out,
@@ -175,7 +186,7 @@ def _capture(args: argparse.Namespace, world: World) -> int:
             all_frames=args.all_frames is True,
             overwrite=args.overwrite,
             world=world,
-            watch=None if served is None else served.watch,
+            watch=watch,
         )
     if not world.is_main:
         return 0
@@ -190,6 +201,10 @@ def _capture(args: argparse.Namespace, world: World) -> int:
             f"in {record.seconds:.0f} s"
         )
     return 0
+
+
+def _log(args: argparse.Namespace, world: World) -> Path | None:
+    return args.tensorboard if world.is_main else None
 
 
 def _settings(args: argparse.Namespace) -> dict[str, Any]:
