@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -97,41 +97,31 @@ def evaluate(
             lies in the method or in a capture, or holds results of another evaluation.
         HwpError: another evaluation is writing to `out`, or `out` cannot be written.
     """
-    if callable(method):
-        with scratch_folder("hwp-method-") as scratch:
-            return evaluate(
-                write_method(method, scratch),
-                captures,
-                out,
-                preset=preset,
-                settings=settings,
-                seed=seed,
-                seconds=seconds,
-                steps=steps,
-                frames=frames,
-                jobs=jobs,
-                overwrite=overwrite,
-            )
-    method = os.fspath(place(method, "method"))
-    suite = captures if isinstance(captures, str) and captures in SUITES else "captures"
-    given = _folders(captures) if suite == "captures" else []
-    of_type(preset, (str, type(None)), "preset", "a text")
-    of_type(settings, (Mapping, type(None)), "settings", "a table of settings by name")
-    if whole_number(jobs, "jobs") < 1:
-        raise UsageError(f"is {jobs}", field="jobs", remedy="Use 1 or more.")
-    plan = EvaluationSettings(
-        suite=suite,
-        preset=preset,
-        run=RunSettings(dict(settings or {}), seed, make_budget(seconds, steps), frames),
-    )
-    folder = place(out, "out") if out is not None else default_folder(method, plan)
-    manifest = read_manifest(find_method(method))
-    check_results_place(manifest, folder, {"captures": given}, "out")
-    check_call(manifest, plan, folder, overwrite=overwrite)
-    rehearsed = suite != "captures" and check_suite(manifest, plan, folder)
-    view = JobsView()
-    engine: Engine = LocalEngine() if jobs == 1 else ParallelEngine(jobs, view)
-    with engine, view if engine.in_turn else nullcontext():
+    with ExitStack() as stack:
+        if callable(method):
+            method = write_method(method, stack.enter_context(scratch_folder("hwp-method-")))
+        method = os.fspath(place(method, "method"))
+        suite = captures if isinstance(captures, str) and captures in SUITES else "captures"
+        given = _folders(captures) if suite == "captures" else []
+        of_type(preset, (str, type(None)), "preset", "a text")
+        of_type(settings, (Mapping, type(None)), "settings", "a table of settings by name")
+        if whole_number(jobs, "jobs") < 1:
+            raise UsageError(f"is {jobs}", field="jobs", remedy="Use 1 or more.")
+        plan = EvaluationSettings(
+            suite=suite,
+            preset=preset,
+            run=RunSettings(dict(settings or {}), seed, make_budget(seconds, steps), frames),
+        )
+        folder = place(out, "out") if out is not None else default_folder(method, plan)
+        manifest = read_manifest(find_method(method))
+        check_results_place(manifest, folder, {"captures": given}, "out")
+        check_call(manifest, plan, folder, overwrite=overwrite)
+        rehearsed = suite != "captures" and check_suite(manifest, plan, folder)
+        view = JobsView()
+        engine: Engine = LocalEngine() if jobs == 1 else ParallelEngine(jobs, view)
+        stack.enter_context(engine)
+        if engine.in_turn:
+            stack.enter_context(view)
         paths = ensure_suite(suite, engine=engine) if suite != "captures" else given
         results = evaluate_method(
             method,

@@ -1,4 +1,4 @@
-"""Commands between captures and other data: `data import`, `data import-video`, `data export`."""
+"""Commands that take other data in: `data import ...` and `data import-video`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from hwp_bench.base.files import check_places
 from hwp_bench.cli.options import (
     add_force,
     add_json,
-    add_out,
     add_splits,
     print_json,
     print_result,
@@ -318,55 +317,10 @@ def _rendered(args: argparse.Namespace) -> int:
     return print_result(args.json, facts, lines)
 
 
-_TRANSFORMS = """examples:
-  hwp-bench data export my_capture -o my_scene
-  hwp-bench data import transforms my_scene -o my_capture
-
-The folder holds nerfstudio's transforms.json, the images and masks that it names, and hands.npz
-with the pose of the hands, as a capture has it. docs/data.md describes both.
-"""
-
-
-def _add_transforms(parser: argparse.ArgumentParser) -> None:
-    parser.description = "Make a capture of a folder with nerfstudio's transforms.json."
-    parser.epilog = _TRANSFORMS
-    parser.add_argument("folder", type=Path, metavar="DIR", help="folder with transforms.json")
-    add_out(parser, "capture folder to make")
-    add_force(parser)
-
-
-def _transforms(args: argparse.Namespace) -> int:
-    from hwp_bench.importers.transforms import import_transforms
-
-    inputs = {"DIR": args.folder}
-    check_places({"--out": args.out}, inputs, replaces=args.force, makes_captures=True)
-    made = import_transforms(args.folder, args.out, overwrite=args.force)
-    print(f"capture: {args.out}, {len(made)} frames, hands: {made.info.hands}")
-    return 0
-
-
-def _add_export(parser: argparse.ArgumentParser) -> None:
-    parser.description = "Write a capture as a folder with nerfstudio's transforms.json."
-    parser.epilog = _TRANSFORMS
-    parser.add_argument("capture", type=Path, metavar="CAPTURE", help="capture folder")
-    add_out(parser, "folder to make")
-    parser.add_argument("--force", action="store_true", help="replace an existing folder")
-
-
-def _export(args: argparse.Namespace) -> int:
-    from hwp_bench.importers.transforms import export_transforms
-
-    check_places({"--out": args.out}, {"CAPTURE": args.capture}, replaces=args.force)
-    print(export_transforms(args.capture, args.out, overwrite=args.force))
-    return 0
-
-
 #: The arguments and the work of each command, where `main` looks for them.
 COMMANDS = {
     "video": (_add_video, _video),
     "wildghand": (_add_wildghand, _wildghand),
     "interhand26m": (_add_interhand26m, _interhand26m),
     "rendered": (_add_rendered, _rendered),
-    "transforms": (_add_transforms, _transforms),
-    "export": (_add_export, _export),
 }

@@ -19,9 +19,6 @@ def command_tree() -> Command:
         "rendered": Command(
             "make predictions of what the authors' code has drawn", f"{here}.imports:rendered"
         ),
-        "transforms": Command(
-            "make a capture of nerfstudio's transforms.json", f"{here}.imports:transforms"
-        ),
     }
     hands = {
         "convert": Command("express hands in another hand model", f"{here}.data:convert"),
@@ -34,7 +31,6 @@ def command_tree() -> Command:
         "get": Command("download a public data set", f"{here}.data:get"),
         "import": Command("make captures or predictions of other data", commands=imports),
         "import-video": Command("make a capture of a video", f"{here}.imports:video"),
-        "export": Command("write a capture as transforms.json", f"{here}.imports:export"),
         "second-view": Command(
             "make a free-view clip of a second camera", f"{here}.data:second_view"
         ),

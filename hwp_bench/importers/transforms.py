@@ -3,115 +3,125 @@
 A frame has `transform_matrix`, camera to world, with OpenGL axes of the camera (x right, y up, z
 backwards), and `fl_x`, `fl_y`, `cx`, `cy` in px, of its own or at the top of the file. Pixel
 centres lie at +0.5 in both formats. `applied_transform` (3, 4) and then `applied_scale` lead from
-the world of the data to the world of the file. nerfstudio has z up there; a capture that was
-filmed upright has y down.
+the world of the data to that of the file, where z is up; a capture filmed upright has y down.
 
-What nerfstudio has no place for stands beside it: the hands in `hands.npz`, as a capture has them,
-in metres of the world of the data; and the other facts of a capture under the key `hwp`.
+The hands stand beside it in `hands.npz`, as a capture has them, in the world of the data (m). The
+other facts of a capture are under the key `hwp`.
 
-Source: nerfstudio, `nerfstudio/data/dataparsers/nerfstudio_dataparser.py` and
-`docs/quickstart/data_conventions.md`.
+Source: nerfstudio, `nerfstudio/data/dataparsers/nerfstudio_dataparser.py`.
 """
 
 from __future__ import annotations
 
 import os
-import shutil
-from collections.abc import Mapping
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from msgspec import Meta
 
 from hwp_bench.base.arrays import read_npz, write_npz
-from hwp_bench.base.errors import BadInput, HwpError, place
+from hwp_bench.base.errors import BadInput, of_type, place
 from hwp_bench.base.files import atomic_folder, inside, read_json, refuse_existing, write_json
-from hwp_bench.base.images import read_gray, read_rgb
-from hwp_bench.capture import Cameras, Capture, CaptureInfo, CaptureWriter, identify_hand_model
-from hwp_bench.capture.folder import open_capture
-from hwp_bench.capture.schema import (
-    HANDS,
-    LARGEST,
-    MAX_FRAMES,
-    SCHEMA,
-    SIDES,
-    frame_name,
-    hand_arrays,
-    image_path,
-    read_hands,
-)
+from hwp_bench.base.images import read_gray, read_rgb, write_image
+from hwp_bench.base.records import Line, parse_record
+from hwp_bench.capture import Cameras, Capture, CaptureInfo, CaptureWriter, schema
+from hwp_bench.capture.folder import identify_hand_model, open_capture
 from hwp_bench.capture.splits import MIN_FRAMES, contiguous_split
 
 #: Name of the file.
 TRANSFORMS = "transforms.json"
-# Camera axes of OpenCV to those of OpenGL, and back.
+_SOURCE = {"kind": "transforms", "importer": {"name": "transforms", "version": 1}}
+# Camera axes of OpenCV to those of OpenGL, and back; a world with y down to one with z up.
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-# From a world with y down to one with z up.
 _UPRIGHT = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
-_PINHOLES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
-# Facts of a capture that follow from its images, or are not true of a copy.
-_FOUND_ANEW = ("digests", "source", "width", "height", "frame_count")
+
+_Number = Annotated[float, Meta(ge=-schema.LARGEST, le=schema.LARGEST)]
+_Rows = Annotated[
+    Sequence[tuple[_Number, _Number, _Number, _Number]], Meta(min_length=3, max_length=4)
+]
+_Zero = Annotated[float, Meta(ge=0.0, le=0.0, description="0: undistort the images first")]
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """A frame, with what the top of the file says of all frames."""
+
+    file_path: Line
+    mask_path: Line
+    transform_matrix: _Rows
+    w: _Number
+    h: _Number
+    fl_x: _Number
+    fl_y: _Number
+    cx: _Number
+    cy: _Number
+    camera_model: Literal["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE"] = "OPENCV"
+    k1: _Zero = 0.0
+    k2: _Zero = 0.0
+    k3: _Zero = 0.0
+    k4: _Zero = 0.0
+    p1: _Zero = 0.0
+    p2: _Zero = 0.0
+    applied_transform: _Rows = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
+    applied_scale: Annotated[float, Meta(gt=0.0, le=schema.LARGEST)] = 1.0
+
+    def viewmat(self) -> np.ndarray:
+        """(4, 4), from the world of the data to the camera, OpenCV axes."""
+        pose, applied = np.eye(4), np.eye(4)
+        pose[:3], applied[:3] = self.transform_matrix[:3], self.applied_transform[:3]
+        pose[:3, 3] /= self.applied_scale
+        return np.linalg.inv(np.linalg.inv(applied) @ pose @ _FLIP)
+
+
+@dataclass(frozen=True)
+class _File:
+    frames: Annotated[list[_Frame], Meta(min_length=1, max_length=schema.MAX_FRAMES)]
 
 
 def export_transforms(
-    capture: Capture | str | os.PathLike[str],
-    out: str | os.PathLike[str],
-    *,
-    overwrite: bool = False,
+    capture: Capture, out: str | os.PathLike[str], *, overwrite: bool = False
 ) -> Path:
     """Write a capture as a folder that nerfstudio's default data parser reads.
 
-    It holds `transforms.json`, the frames in `images/`, the masks in `masks/` and `hands.npz`.
-    The lists `train_filenames`, `val_filenames` and `test_filenames` are the split by the 80/10/10
-    rule, where the capture has frames enough. Truth and free-view clip are left out.
-
-    Returns:
-        The path of `transforms.json`.
+    It returns the path of `transforms.json`, beside `images/`, `masks/` and `hands.npz`. The file
+    lists the split by the 80/10/10 rule. Truth and free-view clip are left out.
 
     Raises:
         UsageError: `out` exists.
         BadInput: a camera has skew, which `transforms.json` cannot express.
     """
-    out = place(out, "out")
-    capture = capture if isinstance(capture, Capture) else open_capture(capture)
-    info, cameras = capture.info, capture.cameras
+    of_type(capture, Capture, "capture", "an opened capture")
+    out, info, cameras = place(out, "out"), capture.info, capture.cameras
     if cameras.Ks[:, 0, 1].any():
         raise BadInput("has skew, for which transforms.json has no field", where=capture.root)
     poses = _UPRIGHT @ np.linalg.inv(cameras.viewmats) @ _FLIP
-    names = [f"images/{frame_name(frame)}" for frame in range(len(capture))]
+    names = [schema.frame_name(frame) for frame in range(len(capture))]
     content: dict[str, Any] = {
-        "camera_model": "OPENCV",
-        "w": info.width,
-        "h": info.height,
+        **{"camera_model": "OPENCV", "w": info.width, "h": info.height},
         "applied_transform": _UPRIGHT[:3].tolist(),
-        "hwp": {name: v for name, v in info.to_json().items() if name not in _FOUND_ANEW},
+        "hwp": {**info.to_json(), "source": {}, "digests": {}},
     }
-    if len(capture) >= MIN_FRAMES:
-        split = contiguous_split(info.id, len(capture))
-        for part, frames in (
-            ("train", split.train),
-            ("val", split.validation),
-            ("test", split.test),
-        ):
-            content[f"{part}_filenames"] = [names[frame] for frame in frames]
+    if len(names) >= MIN_FRAMES:
+        split = contiguous_split(info.id, len(names))
+        parts = {"train": split.train, "val": split.validation, "test": split.test}
+        for part, frames in parts.items():
+            content[f"{part}_filenames"] = [f"images/{names[frame]}" for frame in frames]
     content["frames"] = [
         {
-            "file_path": name,
-            "mask_path": f"masks/{Path(name).name}",
+            **{"file_path": f"images/{name}", "mask_path": f"masks/{name}"},
             **{"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]},
             "transform_matrix": pose.tolist(),
         }
         for name, K, pose in zip(names, cameras.Ks, poses, strict=True)
     ]
-    with atomic_folder(out, overwrite=overwrite, flag="--force") as root:
-        for kind, folder in (("frames", "images"), ("masks", "masks")):
-            (root / folder).mkdir()
-            for frame in range(len(capture)):
-                capture.image(kind, frame)  # a damaged one is named here
-                source = image_path(capture.root, kind, frame)
-                shutil.copyfile(source, root / folder / source.name)
-        write_npz(root / HANDS, hand_arrays(capture.hands))
+    with atomic_folder(out, overwrite=overwrite) as root:
+        for frame, name in enumerate(names):
+            write_image(root / "images" / name, capture.frame(frame))
+            write_image(root / "masks" / name, capture.mask(frame))
+        write_npz(root / schema.HANDS, schema.hand_arrays(capture.hands))
         write_json(root / TRANSFORMS, content)
     return out / TRANSFORMS
 
@@ -119,14 +129,10 @@ def export_transforms(
 def import_transforms(
     source: str | os.PathLike[str], out: str | os.PathLike[str], *, overwrite: bool = False
 ) -> Capture:
-    """Make a capture of a folder with `transforms.json`, masks and `hands.npz`.
+    """Make a capture of a folder, or its `transforms.json`, with masks and `hands.npz`.
 
     `applied_transform` and `applied_scale` are undone, so that the cameras are in the world of the
-    hands, in metres. The frames keep the order of the file, and are rows of the arrays.
-
-    Args:
-        source: the folder, or its `transforms.json`.
-        out: the capture folder to make.
+    hands, in metres. The frames keep the order of the file, as do the rows of `hands.npz`.
 
     Raises:
         BadInput: a field is missing or wrong, a lens is distorted, a frame has no mask, or there
@@ -134,127 +140,37 @@ def import_transforms(
         UsageError: `out` exists.
     """
     file, out = place(source, "source"), place(out, "out")
-    refuse_existing(out, overwrite=overwrite, flag="--force")
+    refuse_existing(out, overwrite=overwrite)
     file = file / TRANSFORMS if file.is_dir() else file
-    content = read_json(file)
-    frames = content.get("frames") if isinstance(content, Mapping) else None
-    if not isinstance(frames, list) or not 0 < len(frames) <= MAX_FRAMES:
-        raise BadInput(f"is not a list of 1 to {MAX_FRAMES} frames", where=file, field="frames")
-    merged = []
-    for number, frame in enumerate(frames):
-        if not isinstance(frame, Mapping):
-            raise BadInput("is not a table", where=file, field=f"frames[{number}]")
-        merged.append({**content, **frame})
-    for one in merged:
-        _check_lens(one, file)
-    sizes = {tuple(int(_numbers(one.get(e), (), e, file)) for e in ("w", "h")) for one in merged}
-    cameras = _read_cameras(content, merged, file)
-    info, sides = _read_info(content, file, sizes, len(frames))
-    hands = read_hands(file.parent / HANDS, sides, len(frames))
-    size = (info.height, info.width)
-    with CaptureWriter(out, info, hands, cameras, overwrite=overwrite) as writer:
-        for number, one in enumerate(merged):
-            writer.frame(number, read_rgb(_file(one, "file_path", number, file), size))
-            writer.mask(number, read_gray(_file(one, "mask_path", number, file), size))
-    return open_capture(out)
-
-
-def _check_lens(frame: Mapping[str, Any], file: Path) -> None:
-    """Refuse a camera that is not a pinhole."""
-    if frame.get("camera_model", "OPENCV") not in _PINHOLES or any(map(frame.get, _DISTORTION)):
-        raise BadInput(
-            "the lens is distorted, and a capture has pinhole cameras",
-            where=file,
-            field="camera_model",
-            remedy="Undistort the images first, and write k1 to k4, p1 and p2 as 0.",
-        )
-
-
-def _read_cameras(content: Mapping[str, Any], frames: list[dict[str, Any]], file: Path) -> Cameras:
-    """The cameras in the world of the data, with OpenCV axes."""
-    applied, Ks, poses = np.eye(4), np.zeros((len(frames), 3, 3)), []
-    if "applied_transform" in content:
-        applied = _matrix(content["applied_transform"], "applied_transform", file)
-    scale = _numbers(content.get("applied_scale", 1.0), (), "applied_scale", file)
-    if scale <= 0.0:
-        raise BadInput("is not above 0", where=file, field="applied_scale")
-    for number, frame in enumerate(frames):
-        for name, (row, column) in (
-            *(("fl_x", (0, 0)), ("fl_y", (1, 1))),
-            *(("cx", (0, 2)), ("cy", (1, 2))),
-        ):
-            field = f"frames[{number}].{name}"
-            Ks[number, row, column] = _numbers(frame.get(name), (), field, file)
-        Ks[number, 2, 2] = 1.0
-        field = f"frames[{number}].transform_matrix"
-        poses.append(_matrix(frame.get("transform_matrix"), field, file))
-    stacked = np.stack(poses)
-    stacked[:, :3, 3] /= scale
+    top = read_json(file)
+    top = top if isinstance(top, dict) else {}
+    listed = top.pop("frames", None)
+    if isinstance(listed, list):
+        listed = [{**top, **one} if isinstance(one, dict) else one for one in listed]
+    options: dict[str, Any] = {"where": file, "error": BadInput, "ignore_unknown": True}
+    frames = parse_record(_File, {"frames": listed}, **options).frames
+    size, hands_file = (int(frames[0].h), int(frames[0].w)), file.parent / schema.HANDS
+    if not hands_file.is_file():
+        remedy = "Write the pose of the hands there, as docs/data.md says."
+        raise BadInput("is missing", where=hands_file, remedy=remedy)
+    arrays = read_npz(hands_file)
+    sides = tuple(side for side in schema.SIDES["both"] if f"{side}_pose" in arrays)
+    shown = next((name for name in schema.SIDES if schema.SIDES[name] == sides), "right")
+    facts: dict[str, Any] = dict.fromkeys(("action", "device", "licence"), "unknown")
+    facts |= {"id": file.absolute().parent.name, "fps": 30.0, "perturbations": {}}
+    facts["hand_model"] = dict(vars(identify_hand_model("anny", shown)))
+    facts |= top["hwp"] if isinstance(top.get("hwp"), dict) else {}
+    facts |= {"schema": schema.SCHEMA, "hands": shown, "frame_count": len(frames), "digests": {}}
+    facts |= {"source": _SOURCE, "height": size[0], "width": size[1]}
+    info = CaptureInfo.from_json(facts, where=os.fspath(file))
+    Ks = [[[one.fl_x, 0.0, one.cx], [0.0, one.fl_y, one.cy], [0.0, 0.0, 1.0]] for one in frames]
     try:
-        viewmats = np.linalg.inv(np.linalg.inv(applied) @ stacked @ _FLIP)
-        return Cameras(Ks, viewmats)
-    except (np.linalg.LinAlgError, HwpError) as error:
+        cameras = Cameras(np.array(Ks), np.stack([one.viewmat() for one in frames]))
+    except (np.linalg.LinAlgError, BadInput) as error:
         raise BadInput(f"a camera is no rigid pinhole ({error})", where=file) from error
-
-
-def _read_info(
-    content: Mapping[str, Any], file: Path, sizes: set[tuple[int, ...]], count: int
-) -> tuple[CaptureInfo, tuple[str, ...]]:
-    """Everything else about the capture, and the sides of its hands."""
-    if len(sizes) != 1:
-        raise BadInput("is not one size for all frames", where=file, field="w, h")
-    if not (file.parent / HANDS).is_file():
-        raise BadInput(
-            "is missing: a capture has the pose of its hands",
-            where=file.parent / HANDS,
-            remedy="Write right_pose (F, 16, 3) rad, right_betas (10,), right_transl (F, 3) m and "
-            "right_valid (F,) bool there, or those of left; docs/capture.md describes them.",
-        )
-    arrays = read_npz(file.parent / HANDS)
-    sides = tuple(side for side in SIDES["both"] if f"{side}_pose" in arrays)
-    shown = "both" if len(sides) == 2 else "".join(sides) or "right"
-    unknown = dict.fromkeys(("action", "device", "licence"), "unknown")
-    given = content.get("hwp")
-    facts: dict[str, Any] = {
-        **unknown,
-        **{"schema": SCHEMA, "id": file.absolute().parent.name, "fps": 30.0, "perturbations": {}},
-        "hand_model": None,
-        **(given if isinstance(given, Mapping) else {}),
-        "hands": shown,
-        **dict(zip(("width", "height"), next(iter(sizes)), strict=True)),
-        "frame_count": count,
-        "source": {"kind": "transforms", "importer": {"name": "transforms", "version": 1}},
-        "digests": {},
-    }
-    if facts["hand_model"] is None:
-        facts["hand_model"] = dict(vars(identify_hand_model("anny", shown)))
-    return CaptureInfo.from_json(facts, where=os.fspath(file)), SIDES[shown]
-
-
-def _numbers(value: Any, shape: tuple[int, ...], field: str, file: Path) -> np.ndarray:
-    try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        array = np.array(np.nan)
-    if array.shape != shape or not (np.abs(array) <= LARGEST).all():
-        kind = f"a matrix {shape}" if shape else "a number"
-        raise BadInput(f"is not {kind} up to {LARGEST:g}", where=file, field=field)
-    return array
-
-
-def _matrix(value: Any, field: str, file: Path) -> np.ndarray:
-    """(4, 4), from rows of which the last may be missing."""
-    if isinstance(value, list) and len(value) == 3:
-        value = [*value, [0.0, 0.0, 0.0, 1.0]]
-    return _numbers(value, (4, 4), field, file)
-
-
-def _file(frame: Mapping[str, Any], name: str, number: int, file: Path) -> Path:
-    value = frame.get(name)
-    if not isinstance(value, str):
-        raise BadInput(
-            "is missing: a capture has a frame and a mask of the hand for each moment",
-            where=file,
-            field=f"frames[{number}].{name}",
-        )
-    return inside(file.parent, value)
+    hands = schema.read_hands(hands_file, info.sides, len(frames))
+    with CaptureWriter(out, info, hands, cameras, overwrite=overwrite) as writer:
+        for number, one in enumerate(frames):
+            writer.frame(number, read_rgb(inside(file.parent, one.file_path), size))
+            writer.mask(number, read_gray(inside(file.parent, one.mask_path), size))
+    return open_capture(out)

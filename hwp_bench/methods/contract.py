@@ -34,7 +34,7 @@ from hwp_bench.hands.skeleton import Camera, HandParameters, HandPose, hand_pose
 
 if TYPE_CHECKING:
     from hwp_bench.hands.skinning import PosedHand
-    from hwp_bench.hands.template import HandTemplate, TemplateTensors
+    from hwp_bench.hands.template import HandTemplate
 
 #: Name of the file that describes a request folder.
 REQUEST = "request.json"
@@ -226,7 +226,7 @@ class TrainingCapture:
                 read_cameras(root / FREE_VIEW / CAMERAS, record.free_view),
             )
         self._own_template = record.own_template
-        self._tensors: dict[str, TemplateTensors] = {}
+        self._templates: dict[str, HandTemplate] = {}
         self._train = np.array(record.train, dtype=np.int64)
         if not np.isin(self._train, self.split.train).all():
             raise BadInput(
@@ -279,49 +279,35 @@ class TrainingCapture:
         return self.cameras.camera(frame, self.width, self.height)
 
     def vertices(self, frame: int | Mapping[str, HandPose]) -> dict[str, np.ndarray]:
-        """Return the vertices of the posed hands.
+        """Return the vertices of the posed hands, (V, 3) float64 m, by side.
 
-        Args:
-            frame: index of any frame, test frames included; or poses by side, as `Avatar.render`
-                is given them.
-
-        Returns:
-            (V, 3) float32, m, in the world of `camera`, by side: of each hand that the frame shows
-            (`hands[side].valid`), or of each pose that is given. `template(side).faces` connects
-            them.
+        They are in the world of `camera`; `template(side).faces` connects them. `frame` is the
+        index of any frame, of which every hand is returned that the frame shows
+        (`hands[side].valid`); or it is poses by side, as `Avatar.render` is given them.
         """
         return {side: hand.vertices[0].numpy() for side, hand in self._posed(frame).items()}
 
     def joints(self, frame: int | Mapping[str, HandPose]) -> dict[str, np.ndarray]:
-        """Return the joints of the posed hands, (16, 3) float32, m, in MANO's order.
+        """Return the joints of the posed hands, (16, 3) float64 m, by side, as `vertices` does.
 
-        Arguments, sides and world are those of `vertices`;
         `hwp_bench.hands.skeleton.JOINT_NAMES` names the rows.
         """
         return {side: hand.joints[0].numpy() for side, hand in self._posed(frame).items()}
 
     def _posed(self, frame: int | Mapping[str, HandPose]) -> dict[str, PosedHand]:
-        import torch
+        from hwp_bench.hands.skinning import pose_parameters
 
-        from hwp_bench.hands.skinning import pose_hand
-
-        hands: Mapping[str, HandPose]
         if isinstance(frame, Mapping):
             hands = frame
         else:
-            frame = whole_number(frame, "frame")
-            if not 0 <= frame < len(self.cameras):
-                last = len(self.cameras) - 1
-                raise UsageError(f"there is no frame {frame}, only 0 to {last}", where=self.root)
-            hands = {s: hand.at(frame, s) for s, hand in self.hands.items() if hand.valid[frame]}
+            shown = {side for side, hand in self.hands.items() if hand.valid[frame]}
+            hands = {side: hand for side, hand in self.hand_poses(frame).items() if side in shown}
         posed = {}
         for side, hand in hands.items():
-            if side not in self._tensors:
-                self._tensors[side] = self.template(side).to_torch()
-            arrays = (hand.pose[None], hand.betas, hand.transl[None])
-            given = (torch.as_tensor(array, dtype=torch.float32) for array in arrays)
-            with torch.no_grad():
-                posed[side] = pose_hand(self._tensors[side], *given)
+            if side not in self._templates:
+                self._templates[side] = self.template(side)
+            arrays = (hand.pose[None], hand.betas, hand.transl[None], np.ones(1, bool))
+            posed[side] = pose_parameters(self._templates[side], HandParameters(*arrays))
         return posed
 
     def template(self, side: str) -> HandTemplate:

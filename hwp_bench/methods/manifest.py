@@ -7,7 +7,7 @@ import importlib.util
 import itertools
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any
@@ -297,14 +297,11 @@ def shipped_methods() -> list[MethodManifest]:
 
 
 def installed_methods() -> list[MethodManifest]:
-    """Return the methods of installed packages by name; a faulty one is left out, and said."""
+    """Return the methods of installed packages; a faulty one is left out, and said."""
     found = []
-    for name, folder in sorted(_installed_folders().items()):
+    for name, folder in _installed_folders().items():
         try:
-            manifest = read_manifest(folder)
-            if manifest.name != name:
-                raise BadMethod(f"is not {name!r}, the entry point", where=folder, field="name")
-            found.append(manifest)
+            found.append(replace(read_manifest(folder), name=name))
         except BadInput as error:
             notice(f"left out: {error}")
     return found
@@ -312,12 +309,12 @@ def installed_methods() -> list[MethodManifest]:
 
 def _installed_folders() -> dict[str, Path]:
     """Folders of the packages that entry points name; nothing of them is imported."""
-    found: dict[str, Path] = {}
+    found, shipped = {}, {folder.name for folder in _shipped_folders()}
     for point in metadata.entry_points(group=ENTRY_POINTS):
         top, *below = point.module.split(".")
         spec = importlib.util.find_spec(top)
-        for place in (spec.submodule_search_locations or ()) if spec else ():
-            found.setdefault(point.name, Path(place, *below))
+        if spec and spec.submodule_search_locations and point.name not in shipped:
+            found[point.name] = Path(spec.submodule_search_locations[0], *below)
     return found
 
 

@@ -11,7 +11,7 @@ import math
 import os
 import platform
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import metadata
 from typing import TYPE_CHECKING, Annotated, Any
@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from msgspec import Meta
 
 from hwp_bench.base import packages
-from hwp_bench.base.errors import MissingDependency, UsageError
+from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import canonical_json, files_digest
 from hwp_bench.base.records import Count, Digest, Line, Message, Seconds, Seed
 from hwp_bench.base.tables import Table
@@ -282,39 +282,25 @@ class Results:
         ]
         return f"Results({', '.join(parts)})"
 
-    def to_frame(self, rows: str = "frames") -> pandas.DataFrame:
-        """Return the scores as a table of pandas, to group, join and plot.
+    def to_frame(self, *, free_view: bool = False) -> pandas.DataFrame:
+        """Return the scores as a table of pandas with a row for each test frame.
 
-        Every row begins with `method`, `suite`, `seed` and `capture`; each metric is a column.
-        Tables of several results are joined by `pandas.concat`.
-
-        Args:
-            rows: `frames`, the test frames; `free-view`, the frames of the free-view clips;
-                `curve`, the checkpoints of the fits with step, seconds and validation scores; or
-                `captures`, the mean over the test frames with seconds, steps and memory.
+        Its columns are `method`, `suite`, `seed`, `capture`, `frame`, one for each metric, and
+        `failure`. `free_view` takes the frames of the free-view clips instead. Tables of several
+        results are joined by `pandas.concat`.
 
         Raises:
             MissingDependency: pandas is not installed.
-            UsageError: there are no such rows.
         """
-        if rows not in _ROWS:
-            raise UsageError(
-                f"is {str(rows)[:100]!r}", field="rows", remedy=f"Use one of {', '.join(_ROWS)}."
-            )
-        try:
-            import pandas
-        except ImportError as error:
-            raise MissingDependency(
-                "pandas is not installed", remedy="pip install 'hwp-bench[pandas]'"
-            ) from error
+        frames = packages.import_extra("pandas", "pandas", "pandas is not installed")
         head = {"method": self.method.title, "suite": self.suite, "seed": self.seed}
-        return pandas.DataFrame(
-            [
-                {**head, "capture": capture.id, **row}
-                for capture in self.captures
-                for row in _ROWS[rows](capture)
-            ]
+        parts = [(item.id, item.free_view if free_view else item) for item in self.captures]
+        rows = [(name, one) for name, part in parts for one in (part.frames if part else ())]
+        table: pandas.DataFrame = frames.DataFrame(
+            {**head, "capture": name, "frame": one.frame, **one.scores, "failure": one.failure}
+            for name, one in rows
         )
+        return table
 
     @property
     def drawn(self) -> bool:
@@ -336,31 +322,6 @@ class Results:
             for frame in capture.frames:
                 return list(frame.scores)
         return []
-
-
-# --- rows of a table of pandas
-
-
-def _frame_rows(frames: Sequence[FrameResult]) -> list[dict[str, Any]]:
-    return [{"frame": one.frame, **one.scores, "failure": one.failure} for one in frames]
-
-
-def _capture_row(capture: CaptureResult) -> dict[str, Any]:
-    names = ("fit_seconds", "cpu_seconds", "render_seconds", "steps", "peak_memory", "device")
-    frames = [one.scores for one in capture.frames]
-    means = {name: math.fsum(one[name] for one in frames) / len(frames) for name in frames[0]}
-    return {**means, **{name: getattr(capture, name) for name in names}, "failure": capture.failure}
-
-
-#: What `Results.to_frame` can show of a capture, by name.
-_ROWS: dict[str, Callable[[CaptureResult], list[dict[str, Any]]]] = {
-    "frames": lambda capture: _frame_rows(capture.frames),
-    "free-view": lambda capture: _frame_rows(capture.free_view.frames if capture.free_view else []),
-    "curve": lambda capture: [
-        {"step": one.step, "seconds": one.seconds, **one.scores} for one in capture.curve
-    ],
-    "captures": lambda capture: [_capture_row(capture)],
-}
 
 
 # --- bounds, checked before a number is used

@@ -19,22 +19,26 @@ from wildghand.cli.options import (
 
 if TYPE_CHECKING:
     from wildghand.fitting.parallel import World
+    from wildghand.fitting.session import Watch
     from wildghand.from_video import MadeAvatar
-    from wildghand.viewer.live import ServedFit
 
 
 @contextlib.contextmanager
-def watching(args: argparse.Namespace, *, shown: bool) -> Iterator[ServedFit | None]:
-    """Serve the page of a fit while the block runs, if it is `shown`."""
-    if not shown:
-        yield None
-        return
+def watching(args: argparse.Namespace, world: World) -> Iterator[tuple[Watch | None, Any]]:
+    """Yield who is shown the fit and its import while the block runs: a page, TensorBoard."""
     from hwp_bench.base.console import notice
-    from wildghand.viewer.live import serve_fit
+    from wildghand.fitting.tensorboard import logging_fit
 
-    with serve_fit(address_of(args)) as served:
-        notice(f"The fit is shown at {served.url}")
-        yield served
+    watch = glimpse = None
+    with contextlib.ExitStack() as stack:
+        if args.live and world.is_main:
+            from wildghand.viewer.live import serve_fit
+
+            served = stack.enter_context(serve_fit(address_of(args)))
+            notice(f"The fit is shown at {served.url}")
+            watch, glimpse = served.watch, served.glimpse
+        log = args.tensorboard if world.is_main else None
+        yield stack.enter_context(logging_fit(log, watch)), glimpse
 
 
 _FIT_EXAMPLES = """examples:
@@ -108,7 +112,6 @@ def do_fit(args: argparse.Namespace) -> int:
 
 
 def _video(args: argparse.Namespace, world: World) -> int:
-    from wildghand.fitting.tensorboard import logging_fit
     from wildghand.from_video import VideoFit, make_avatar
 
     options = VideoFit(
@@ -123,10 +126,7 @@ def _video(args: argparse.Namespace, world: World) -> int:
         seed=args.seed,
         settings=_settings(args),
     )
-    with (
-        watching(args, shown=args.live and world.is_main) as served,
-        logging_fit(_log(args, world), None if served is None else served.watch) as watch,
-    ):
+    with watching(args, world) as (watch, glimpse):
         made = make_avatar(
             args.source,
             args.out,
@@ -134,7 +134,7 @@ def _video(args: argparse.Namespace, world: World) -> int:
             overwrite=args.overwrite,
             world=world,
             watch=watch,
-            glimpse=None if served is None else served.glimpse,
+            glimpse=glimpse,
         )
     if world.is_main:
         print_json(made.facts()) if args.json else _print(made)
@@ -160,7 +160,6 @@ def _capture(args: argparse.Namespace, world: World) -> int:
     from hwp_bench.base.errors import UsageError
     from hwp_bench.methods.contract import Budget
     from wildghand.fitting.session import fit_capture
-    from wildghand.fitting.tensorboard import logging_fit
     from wildghand.from_video.run import with_quick
 
     for option in ("side", "landmarks", "model", "hand-model"):
@@ -173,10 +172,7 @@ def _capture(args: argparse.Namespace, world: World) -> int:
     if args.seconds is not None and not args.seconds > 0.0:
         raise UsageError(f"is {args.seconds}", field="--seconds", remedy="Use more than 0.")
     check_fitting(args)
-    with (
-        watching(args, shown=args.live and world.is_main) as served,
-        logging_fit(_log(args, world), None if served is None else served.watch) as watch,
-    ):
+    with watching(args, world) as (watch, _):
         avatar = fit_capture(
             args.source,
             args.out,
@@ -201,10 +197,6 @@ def _capture(args: argparse.Namespace, world: World) -> int:
             f"in {record.seconds:.0f} s"
         )
     return 0
-
-
-def _log(args: argparse.Namespace, world: World) -> Path | None:
-    return args.tensorboard if world.is_main else None
 
 
 def _settings(args: argparse.Namespace) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""A fit in TensorBoard: its curves, its speed and pictures of a training frame, while it runs."""
+"""A fit in TensorBoard: curves and pictures of a training frame, while it runs."""
 
 from __future__ import annotations
 
@@ -7,14 +7,13 @@ import math
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from hwp_bench.base.errors import MissingDependency
-from wildghand.fitting.fit import Fit
+from hwp_bench.base.packages import import_extra
 from wildghand.fitting.glance import LEAST_PAUSE, Glance, Live
 from wildghand.fitting.session import Watch
-from wildghand.gaussians.fit_loop import Loss
 
 # Seconds between two pictures; a curve has a point for every look.
 _PICTURES = 30.0
@@ -26,46 +25,32 @@ def logging_fit(
 ) -> Iterator[Watch | None]:
     """Yield what a fit calls after each step: `watch`, and what writes event files to a folder.
 
-    The first training frame is looked at, once in `pause` seconds at most and for a tenth of the
-    time. Loss, PSNR over the pixels of the hand (dB) and steps in a second become curves. Without a
-    folder nothing is written.
-
-    Raises:
-        MissingDependency: tensorboard is not installed.
+    Curves are the loss and the PSNR (dB) over the hand in the first training frame, which is drawn
+    once in `pause` seconds at most. Without a folder nothing is written.
     """
     if folder is None:
         yield watch
         return
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError as error:
-        raise MissingDependency(
-            "tensorboard is not installed", remedy="pip install 'hwp-bench[tensorboard]'"
-        ) from error
-    seen, moment, drawn = 0, math.inf, -math.inf
+    problem = "tensorboard is not installed"
+    writers = import_extra("torch.utils.tensorboard", "tensorboard", problem)
+    drawn = -math.inf
 
     def show(look: Glance) -> None:
-        nonlocal seen, moment, drawn
-        now = time.monotonic()
+        nonlocal drawn
         writer.add_scalar("fit/loss", look.loss, look.step)
         writer.add_scalar("fit/psnr", look.psnr, look.step)
-        if now > moment:
-            speed = (look.step - seen) / (now - moment)
-            writer.add_scalar("fit/steps_per_second", speed, look.step)
-        seen, moment = look.step, now
-        if now >= drawn + _PICTURES:
+        if time.monotonic() >= drawn + _PICTURES:
             weights = np.repeat(look.weights[..., None], 3, axis=2)
             sheet = np.concatenate([look.truth, look.avatar, weights], axis=1)
             writer.add_image("fit/frame_avatar_weights", sheet, look.step, dataformats="HWC")
-            drawn = now
+            drawn = time.monotonic()
         writer.flush()
 
-    live = Live(show, pause=pause)
+    watches: list[Watch] = [*([watch] if watch else []), Live(show, pause=pause)]
 
-    def both(fit: Fit, step: int, loss: Loss) -> None:
-        if watch is not None:
-            watch(fit, step, loss)
-        live(fit, step, loss)
+    def call(*looked: Any) -> None:
+        for one in watches:
+            one(*looked)
 
-    with contextlib.closing(SummaryWriter(folder)) as writer:
-        yield both
+    with contextlib.closing(writers.SummaryWriter(folder)) as writer:
+        yield call

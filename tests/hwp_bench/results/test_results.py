@@ -14,7 +14,7 @@ import pytest
 from small_captures import results_example
 
 from hwp_bench.analysis.cost import machine_notes
-from hwp_bench.base.errors import BadInput, BadResult, MissingDependency, UsageError
+from hwp_bench.base.errors import BadInput, BadResult, MissingDependency
 from hwp_bench.base.tables import to_markdown
 from hwp_bench.evaluation.sentences import outcome_lines
 from hwp_bench.report.tables import all_tables
@@ -130,13 +130,8 @@ def test_results_become_tables_of_pandas(make_results) -> None:
     ]
     assert frames["frame"].tolist() == [18, 19]
     assert frames.groupby("capture")["psnr"].mean().to_dict() == {"capture2": 20.5}
-    assert results.to_frame("free-view")["psnr"].tolist() == [20.0]
-    curve = results.to_frame("curve").iloc[0]
-    assert (curve["step"], curve["seconds"], curve["psnr"]) == (5, 1.0, 15.0)
-    row = results.to_frame("captures").iloc[0]
-    assert (row["psnr"], row["fit_seconds"], row["steps"]) == (20.5, 2.0, 10)
-    with pytest.raises(UsageError, match="rows: is 'x'. Use one of frames, free-view, curve"):
-        results.to_frame("x")
+    assert results.to_frame(free_view=True)["psnr"].tolist() == [20.0]
+    assert make_results().to_frame(free_view=True).empty
 
 
 def test_without_pandas_a_table_says_what_to_install(

@@ -41,7 +41,6 @@ def test_curves_and_a_picture_of_a_fit(
         points = read.Scalars(name)
         assert [point.step for point in points] == [1, 2, 3, 4, 5, 6]
         np.testing.assert_allclose([point.value for point in points], expected, rtol=1e-6)
-    assert [point.step for point in read.Scalars("fit/steps_per_second")] == [2, 3, 4, 5, 6]
     (picture,) = read.Images("fit/frame_avatar_weights")
     pixels = np.asarray(Image.open(io.BytesIO(picture.encoded_image_string)))
     parts = [looks[0].truth, looks[0].avatar, np.repeat(looks[0].weights[..., None], 3, axis=2)]
