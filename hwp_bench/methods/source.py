@@ -37,7 +37,7 @@ def write_method(factory: Any, root: Path) -> Path:
     module: Any = sys.modules.get(str(getattr(factory, "__module__", "")))
     statements: dict[str, None] = {}
     if getattr(module, name or " ", None) is factory:
-        _collect(name, _sources(module), statements, set())
+        _collect(name, module, _sources(module), statements, set())
     if not statements:
         raise UsageError(
             "is not a class or function at the top level of a file or notebook",
@@ -66,18 +66,22 @@ def _sources(module: Any) -> list[tuple[str, ast.stmt]]:
 
 def _collect(
     name: str,
+    module: Any,
     sources: list[tuple[str, ast.stmt]],
     statements: dict[str, None],
     seen: set[str],
 ) -> None:
     """Take the statement that binds a name, behind those that bind what it uses in turn."""
     seen.add(name)
-    text, node = next((one for one in sources if name in _bound(one[1])), ("", None))
-    if node is None:
-        return
+    text = next((text for text, node in sources if name in _bound(node)), "")
+    # A cell may have run again, so that a number is not that of the last source.
+    value = getattr(module, name, None)
+    if text and (type(value) in (bool, int, str) or (type(value) is float and value - value == 0)):
+        text = f"{name} = {value!r}"
     for used in sorted(_used(symtable.symtable(text, "method", "exec")) - seen):
-        _collect(used, sources, statements, seen)
-    statements[text] = None
+        _collect(used, module, sources, statements, seen)
+    if text:
+        statements[text] = None
 
 
 def _bound(node: ast.stmt) -> set[str]:

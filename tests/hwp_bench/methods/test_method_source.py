@@ -72,7 +72,7 @@ def test_the_source_takes_along_what_it_uses(factory: Any, tmp_path: Path) -> No
     assert read_manifest(folder).training.kinds == ("private",)
 
 
-def cells(*sources: str) -> types.ModuleType:
+def cells(*sources: str) -> Any:
     """Run cells as a notebook does: their source is kept, and no file is behind them."""
     module = types.ModuleType("notebook_of_the_test")
     sys.modules[module.__name__] = module
@@ -93,6 +93,9 @@ def test_cells_of_a_notebook_are_source_and_the_last_one_counts(tmp_path: Path) 
     )
     made = run(write_method(notebook.Mine, tmp_path), "Mine")
     assert made.value == notebook.Mine({}, 0).value == 3.0
+    # The first cell runs again.
+    notebook.level = 1.0
+    assert run(write_method(notebook.Mine, tmp_path / "again"), "Mine").value == 1.0
 
 
 def test_what_has_no_source_of_its_own_is_refused(tmp_path: Path) -> None:
