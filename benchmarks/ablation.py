@@ -16,7 +16,6 @@ from __future__ import annotations
 import argparse
 import datetime
 import shutil
-import subprocess
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -32,7 +31,7 @@ from hwp_bench.analysis.pairing import MethodRuns, common_metrics, scopes
 from hwp_bench.base.console import notice
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import atomic_write, read_json, write_json
-from hwp_bench.base.packages import PACKAGES
+from hwp_bench.base.packages import checkout_commit
 from hwp_bench.base.records import parse_record
 from hwp_bench.base.tables import Column, Table, format_table
 from hwp_bench.cli.main import main as hwp_bench
@@ -372,22 +371,12 @@ def command_of(study: Study) -> str:
     )
 
 
-def _commit() -> str:
-    """The commit of the working tree, and whether files differ from it."""
-
-    def git(*words: str) -> str:
-        done = subprocess.run(["git", *words], cwd=PACKAGES, capture_output=True, text=True)
-        return done.stdout.strip()
-
-    changed = " with changes" if git("status", "--porcelain", "--", "hwp_bench", METHOD) else ""
-    return (git("rev-parse", "--short=10", "HEAD") or "unknown commit") + changed
-
-
 def _started(folder: Path, asked: Study) -> Study:
     """Put a start on record; the commits of earlier ones stay."""
     path = folder / RECORD
     starts = parse_record(Study, read_json(path), where=path).starts if path.is_file() else ()
-    commit, day = _commit(), datetime.datetime.now(datetime.UTC).date().isoformat()
+    commit = checkout_commit() or "unknown commit"
+    day = datetime.datetime.now(datetime.UTC).date().isoformat()
     if not any(start.startswith(f"{commit},") for start in starts):
         starts = (*starts, f"{commit}, {day}")
     study = replace(asked, starts=starts)

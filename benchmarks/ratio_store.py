@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import datetime
 import functools
 import importlib
 import math
@@ -13,6 +14,7 @@ from typing import Any, Final, Literal
 
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.files import read_json, write_json
+from hwp_bench.base.packages import checkout_commit
 from hwp_bench.base.records import Line, number, parse_record
 from hwp_bench.results.schema import environment
 
@@ -70,6 +72,8 @@ class Benchmark:
     quick: bool = False
     #: Where the ratios were measured.
     machine: Line = ""
+    #: Commit and day of the measurement; empty where it was not recorded.
+    measured: Line = ""
     #: The ratios.
     ratios: list[Ratio] = field(default_factory=list)
 
@@ -133,7 +137,8 @@ def updated(benchmark: Benchmark, found: Mapping[str, float]) -> Benchmark:
         else ratio
         for ratio in benchmark.ratios
     ]
-    return dataclasses.replace(benchmark, ratios=ratios, machine=this_machine())
+    measured = f"{checkout_commit()}, {datetime.datetime.now(datetime.UTC).date().isoformat()}"
+    return dataclasses.replace(benchmark, ratios=ratios, machine=this_machine(), measured=measured)
 
 
 @functools.cache

@@ -2,25 +2,32 @@
 
 Run from the repository: `python -m benchmarks.validation trimmed wild` fits the captures that
 `trials.toml` names for a baseline with its preset, and once more with each of the six trials there,
-and prints mean PSNR over the validation frames. Other rows are asked for like this:
+and prints mean PSNR over the validation frames; without a name all baselines have their turn. Other
+rows are asked for like this:
 `python -m benchmarks.validation trimmed --captures wild-dev-0 --set patch=false`.
 
-With `--seconds` fits end after so many processor seconds. Test frames are read with `--test` alone,
-which shows what a setting brings: nothing is tuned by it.
+With `--seconds` fits end after so many processor seconds. Each fit leaves a line in
+`tuning.jsonl`, and is not made a second time; `hwp-bench dev docs-results` writes the tables of
+`docs/studies/tuning.md` from it. Test frames are read with `--test` alone, which shows what a
+setting brings: nothing is tuned by it, and nothing is kept.
 """
 
 from __future__ import annotations
 
 import argparse
+import datetime
+import json
 import tempfile
 import time
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from hwp_bench.base.errors import BadInput
 from hwp_bench.base.records import merged
 from hwp_bench.capture import open_capture
 from hwp_bench.capture.splits import contiguous_split
@@ -30,8 +37,12 @@ from hwp_bench.evaluation.scoring import Prediction, mean_scores, read_targets, 
 from hwp_bench.methods import find_method, read_manifest
 from hwp_bench.methods.contract import Avatar, Budget, RunSettings
 from hwp_bench.methods.request import open_request, write_request
+from hwp_bench.results.schema import environment
 from hwp_bench.run.worker import load_entry, render
 from hwp_bench.sim.produce.capture import ensure_suite, suite
+
+#: The fits that were made, a JSON object a line.
+LOG = Path(__file__).with_name("tuning.jsonl")
 
 
 def read_trials() -> dict[str, dict[str, list[str]]]:
@@ -94,8 +105,8 @@ def score_fit(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    text = "method directories, or names of shipped methods"
-    parser.add_argument("methods", nargs="+", metavar="METHOD", help=text)
+    text = "method directories, or names of baselines"
+    parser.add_argument("methods", nargs="*", metavar="METHOD", help=f"{text} (default: all)")
     parser.add_argument("--suite", default="wild-dev", help="where the captures are from")
     parser.add_argument("--captures", nargs="+", help="their names (default: those of trials.toml)")
     parser.add_argument("--preset", default="smoke")
@@ -103,13 +114,14 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, help="processor seconds of a fit, without --steps")
     parser.add_argument("--test", action="store_true", help="score test frames; never tune by it")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--log", type=Path, default=LOG, help="what is kept of each fit")
     parser.add_argument(
         "--set",
         action="append",
         help="NAME=VALUE,...: one row of the table, in place of the trials",
     )
     arguments = parser.parse_args()
-    for method in arguments.methods:
+    for method in arguments.methods or read_trials():
         print_table(method, arguments)
 
 
@@ -129,12 +141,59 @@ def print_table(method: str, arguments: argparse.Namespace) -> None:
     print("| --- |" + " ---: |" * (len(items) + 1), flush=True)
     for text in ["", *trials]:
         settings = merged(preset, overrides(text.split(",") if text else []))
-        scores = [
-            score_fit(method, path, settings, budget, arguments.seed, test=arguments.test)
-            for path in captures
-        ]
+        scores = []
+        for path in captures:
+            given = method, path, settings, budget, arguments.seed
+            if arguments.test:
+                scores.append(score_fit(*given, test=True))
+                continue
+            fit = {
+                "method": manifest.name,
+                "digest": manifest.digest,
+                "trial": text,
+                "capture": open_capture(path).info.id,
+                "data": open_capture(path).digest,
+                "preset": arguments.preset,
+                "limit": _limit(arguments),
+                "seed": arguments.seed,
+            }
+            scores.append(kept_score(arguments.log, fit, partial(score_fit, *given)))
         cells = " | ".join(f"{score:.2f}" for score in (*scores, float(np.mean(scores))))
         print(f"| {text.replace(',', ' ') or 'preset'} | {cells} |", flush=True)
+
+
+def _limit(arguments: argparse.Namespace) -> str:
+    if arguments.seconds is not None:
+        return f"{arguments.seconds:g} processor seconds"
+    return f"{arguments.steps} steps"
+
+
+def kept_score(log: Path, fit: Mapping[str, Any], make: Callable[[], float]) -> float:
+    """Return the score of a fit from the log; one that is not there is made and kept."""
+    for line in read_log(log):
+        if fit.items() <= line.items():
+            return float(line["score"])
+    score = make()
+    facts = environment()
+    made = {
+        "score": round(score, 4),
+        "commit": facts["commit"],
+        "day": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        "machine": f"{facts['processor']}, {facts['cores']} cores",
+    }
+    with log.open("a", encoding="utf-8") as stream:
+        stream.write(json.dumps({**fit, **made}) + "\n")
+    return score
+
+
+def read_log(log: Path) -> list[dict[str, Any]]:
+    """Return the fits of a log, the oldest first; none where there is no log."""
+    lines = log.read_text("utf-8").splitlines() if log.is_file() else []
+    try:
+        return [json.loads(line) for line in lines]
+    except json.JSONDecodeError as error:
+        remedy = "Remove the line; its fit is made again."
+        raise BadInput("holds a line that is not JSON", where=log, remedy=remedy) from error
 
 
 if __name__ == "__main__":

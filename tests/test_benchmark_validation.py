@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from painted import QUICK, SilentReport
 
-from benchmarks.validation import read_trials, score_fit
+from benchmarks.validation import kept_score, read_log, read_trials, score_fit
+from hwp_bench.base.errors import BadInput
 from hwp_bench.base.records import merged
 from hwp_bench.capture import Capture
 from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.cli.options import overrides
 from hwp_bench.methods import find_method, read_manifest
 from hwp_bench.methods.contract import Budget, TrainingCapture
-from hwp_bench.methods.settings import settings_from
+from hwp_bench.methods.manifest import shipped_methods
 from hwp_bench.metrics.score import score_frame
 from hwp_bench.run.worker import load_entry
 from plain_fit.method import PlainMethod
@@ -39,14 +41,39 @@ def test_the_score_is_the_mean_over_frames_that_no_step_saw(
     assert found == pytest.approx(np.mean(scores), abs=1e-3)
 
 
+def test_every_baseline_that_ships_has_trials() -> None:
+    names = {method.name for method in shipped_methods()} - {"wildghand"}
+    assert read_trials().keys() == names
+
+
 @pytest.mark.parametrize("name", read_trials())
 def test_each_baseline_has_as_many_trials_and_all_can_be_run(name: str) -> None:
     listed: Any = read_trials()[name]
     assert len(listed["captures"]) == 2
     assert len(set(listed["trials"])) == 6
     manifest = read_manifest(find_method(name))
-    kind = load_entry(manifest.root, str(manifest.entry.python)).settings_type
-    smoke = settings_from(kind, manifest.presets["smoke"], name)
+    make: Any = load_entry(manifest.root, str(manifest.entry.python))
+    preset = manifest.presets["smoke"]
+    made = [make(preset, 0).settings]
     for text in listed["trials"]:
-        values = merged(manifest.presets["smoke"], overrides(text.split(",")))
-        assert settings_from(kind, values, name) != smoke
+        settings = make(merged(preset, overrides(text.split(","))), 0).settings
+        assert settings not in made
+        made.append(settings)
+
+
+def test_a_fit_is_made_once_and_found_in_the_log(tmp_path: Path) -> None:
+    log, made = tmp_path / "log.jsonl", []
+
+    def make() -> float:
+        made.append(len(made))
+        return 20.0 + len(made)
+
+    first = {"method": "plain", "trial": "", "capture": "a", "seed": 0}
+    assert kept_score(log, first, make) == 21.0
+    assert kept_score(log, {**first, "capture": "b"}, make) == 22.0
+    assert kept_score(log, first, make) == 21.0
+    assert len(made) == 2
+    assert [line["score"] for line in read_log(log)] == [21.0, 22.0]
+    log.write_text(log.read_text() + '{"method":')
+    with pytest.raises(BadInput, match=r"log.jsonl.*not JSON"):
+        read_log(log)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 from collections.abc import Callable, Mapping
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -43,6 +45,23 @@ def import_extra(module: str, extra: str, problem: str) -> Any:
     except ImportError as error:
         remedy = f"pip install 'hwp-bench[{extra}]'"
         raise MissingDependency(problem, remedy=remedy) from error
+
+
+@cache
+def checkout_commit() -> str:
+    """Return the commit of the checkout, and whether its code differs; empty in a wheel."""
+
+    def git(*words: str) -> str:
+        done = subprocess.run(["git", *words], cwd=PACKAGES, capture_output=True, text=True)
+        return done.stdout.strip()
+
+    try:
+        commit = git("rev-parse", "--short=10", "HEAD") if (PACKAGES / ".git").exists() else ""
+        code = ("hwp_bench", "wildghand", "baselines")
+        changed = commit and git("status", "--porcelain", "--", *code)
+    except OSError:  # No git.
+        return ""
+    return commit + (" with changes" if changed else "")
 
 
 def lazy_names(

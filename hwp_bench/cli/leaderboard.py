@@ -35,6 +35,7 @@ docs/submissions.md says how a row gets on the board and what its level and badg
 _ADD = """examples:
   hwp-bench leaderboard add runs/mine-mini
   hwp-bench leaderboard add runs/* --entries board/entries
+  hwp-bench leaderboard add runs/field/mini       # every method and seed in the folder
 
 For the maintainers of a board: writes into its folder. Others make a submission.
 """
@@ -80,6 +81,7 @@ names.json, next to the folder of entries. `leaderboard add` lists what it adds.
 """
 _CONFIRM = """examples:
   hwp-bench leaderboard confirm runs/mine-mini --by maintainers
+  hwp-bench leaderboard confirm runs/field/mini --by maintainers
   hwp-bench leaderboard confirm runs/second-run --by maintainers --tolerance 0.05
   hwp-bench leaderboard confirm runs/second-run --by maintainers --entry mine-mini-seed0-0123abcd
 
@@ -169,7 +171,7 @@ def _add_submit(parser: argparse.ArgumentParser) -> None:
 
 def _add_confirm(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("results", metavar="RESULTS", help="results folder with predictions")
+    add("results", nargs="+", metavar="RESULTS", help="results folder with predictions")
     add("--by", required=True, metavar="NAME", help="who checks")
     add("--entry", metavar="NAME", help="entry, where several fit")
     text = "largest difference of the macro mean of PSNR of a second run (default 0.1)"
@@ -189,14 +191,18 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _add(args: argparse.Namespace, folder: Path) -> int:
-    from hwp_bench.leaderboard.rules import check_source
-    from hwp_bench.leaderboard.submit import add_entry
+    from hwp_bench.leaderboard.entries import make_entry
+    from hwp_bench.leaderboard.rules import check_complete, check_source
+    from hwp_bench.leaderboard.submit import add_entries
     from hwp_bench.results import read_results, results_among
 
+    found = []
     for file in results_among(args.results):
-        results = read_results(file)
+        found.append(read_results(file))
         check_source(file)
-        notice(f"entry: {add_entry(folder, results)}")
+        check_complete(make_entry(found[-1]))
+    for entry in add_entries(folder, found):
+        notice(f"entry: {entry}")
     return 0
 
 
@@ -293,35 +299,42 @@ def _confirm(args: argparse.Namespace, folder: Path) -> int:
     from hwp_bench.leaderboard.entries import read_entries, refuse_installed, write_check
     from hwp_bench.leaderboard.rules import left_out
     from hwp_bench.leaderboard.submit import confirm, entry_of
-    from hwp_bench.results import read_results, result_files
+    from hwp_bench.results import read_results, results_among
 
     _check_line("--by", args.by)
     refuse_installed(folder)
     _refuse_none(folder)
-    (file,) = result_files(args.results)
-    entries = read_entries(folder, left_out)
-    # Before a suite is rendered for it.
-    entry = entry_of(entries, read_results(file), args.entry)
     if not 0 <= args.tolerance <= 100:
         raise UsageError(f"{args.tolerance} is not between 0 and 100 dB", field="--tolerance")
-    check = confirm(
-        entry,
-        file,
-        captures_of(args.captures, file),
-        by=args.by,
-        tolerance=args.tolerance,
-        overrules=args.overrules,
-        reason=args.reason,
-    )
-    notice(f"check: {write_check(folder, check)}")
+    files = results_among(args.results)
+    if len(files) > 1 and (args.entry or args.overrules):
+        raise UsageError("is of one result", field="--entry" if args.entry else "--overrules")
+    entries = read_entries(folder, left_out)
+    # Before a suite is rendered for them.
+    chosen = [entry_of(entries, read_results(file), args.entry) for file in files]
+    checks = []
+    for entry, file in zip(chosen, files, strict=True):
+        check = confirm(
+            entry,
+            file,
+            captures_of(args.captures, file),
+            by=args.by,
+            tolerance=args.tolerance,
+            overrules=args.overrules,
+            reason=args.reason,
+        )
+        notice(f"check: {write_check(folder, check)}")
+        checks.append(check)
+        if not args.json:
+            print(f"{check.entry}: {check.kind}, {check.verdict} ({check.frames} frames)")
+        if check.rerun and not args.json:
+            psnr = check.scores["psnr"]
+            print(f"  second run {check.rerun[:8]}: PSNR {psnr:.2f} dB (macro mean)")
+            print(f"  captures with the same predictions: {check.same_predictions}")
     if args.json:
-        print_json(asdict(check))
-        return 0 if check.verdict == "reproduces" else 1
-    print(f"{check.entry}: {check.kind}, {check.verdict} ({check.frames} frames)")
-    if check.rerun:
-        print(f"  second run {check.rerun[:8]}: PSNR {check.scores['psnr']:.2f} dB (macro mean)")
-        print(f"  captures with the same predictions: {check.same_predictions}")
-    return 0 if check.verdict == "reproduces" else 1
+        found = [asdict(check) for check in checks]
+        print_json(found if found[1:] else found[0])
+    return 0 if all(check.verdict == "reproduces" for check in checks) else 1
 
 
 def _contest(args: argparse.Namespace, folder: Path) -> int:

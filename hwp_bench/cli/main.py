@@ -41,6 +41,11 @@ def command_tree() -> Command:
             "divide captures into a public and a sealed part", f"{here}.data:publish"
         ),
     }
+    dev = {
+        "docs-results": Command(
+            "write the results in pages of the documentation", f"{here}.dev:docs-results"
+        ),
+    }
     return Command(
         "benchmark for hand avatars from perturbed in-the-wild video",
         commands={
@@ -61,6 +66,7 @@ def command_tree() -> Command:
             "sim": Command("simulate captures", f"{here}.sim"),
             "completion": Command("print completion for a shell", f"{here}.toolkit:completion"),
             "stability": Command("run the numerical hard cases", f"{here}.toolkit:stability"),
+            "dev": Command("keep this repository as it should be", commands=dev),
         },
     )
 

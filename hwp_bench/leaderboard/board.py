@@ -98,7 +98,7 @@ class BoardRow:
         """Whether no capture or test frame of the suite is missing."""
         return not find_missing(self.first)
 
-    @property
+    @cached_property
     def scores(self) -> Mapping[str, float]:
         """Headline scores by metric, means over the seeds."""
         found = [entry.counted.scores for entry in self.entries]

@@ -286,6 +286,8 @@ class Entry:
     def counted(self) -> Results:
         """The results that the board shows: while it is contested, those with the lower PSNR."""
         others = [one.results for one in self.open_contests if one.results]
+        if not others:
+            return self.results
         return min([self.results, *others], key=lambda results: results.scores["psnr"])
 
     @property

@@ -27,7 +27,7 @@ from hwp_bench.evaluation.capture_evaluation import RESULT, key_of
 from hwp_bench.evaluation.verify import Discrepancy, copy_differences, digest_differences
 from hwp_bench.leaderboard.entries import LEVELS, Check, Contest, Entry, make_entry, read_entries
 from hwp_bench.leaderboard.suite_data import CaptureData, known_data, on_current_data, suite_origins
-from hwp_bench.methods.manifest import shipped_methods
+from hwp_bench.methods.manifest import MethodManifest, shipped_methods
 from hwp_bench.metrics import HWP_V1, PROTOCOLS, metric_names, penalty
 from hwp_bench.metrics.score import aggregate
 from hwp_bench.results import Results
@@ -329,16 +329,22 @@ def check_names(entries: Iterable[Entry], listed: frozenset[str]) -> None:
 
 
 @cache
+def shipped_manifests() -> list[MethodManifest]:
+    """The methods that ship, read once."""
+    return shipped_methods()
+
+
+@cache
 def _declared() -> dict[str, TrainingData]:
     """The training data that methods that ship declare, by their digests."""
-    return {manifest.digest: manifest.training for manifest in shipped_methods()}
+    return {manifest.digest: manifest.training for manifest in shipped_manifests()}
 
 
 @cache
 def _shipped() -> dict[str, str]:
     """Names of methods by their names and titles, as these look."""
     found: dict[str, str] = {}
-    for manifest in shipped_methods():
+    for manifest in shipped_manifests():
         found |= {_look(manifest.name): manifest.name, _look(manifest.title): manifest.name}
     return found
 

@@ -46,18 +46,22 @@ PLACE = "leaderboard/entries"
 TEXT = "PULL_REQUEST.md"
 
 
-def add_entry(folder: Path, results: Results) -> Path:
-    """Write an entry of results without a submission; returns its file.
+def add_entries(folder: Path, results: Iterable[Results]) -> list[Path]:
+    """Write entries of results without a submission; returns their files.
 
-    An entry under the name of a method that ships is registered: see `names`.
+    Results that have an entry stay as they are. Entries under the name of a method that ships are
+    registered. Nothing is written where one of them cannot stand.
     """
-    entry = make_entry(results)
-    check_current(entry)
-    check_entries([*sound_entries(folder), entry])
-    check_bound(entry)
-    file = write_entry(folder, entry)
-    register(folder, [entry])
-    return file
+    known = sound_entries(folder)
+    made = [make_entry(one) for one in results]
+    for entry in made:
+        check_current(entry)
+    check_entries([*known, *(one for one in made if one.name not in {e.name for e in known})])
+    for entry in made:
+        check_bound(entry)
+    files = [write_entry(folder, entry) for entry in made]
+    register(folder, made)
+    return files
 
 
 def submit(

@@ -11,6 +11,7 @@ from __future__ import annotations
 import ast
 import math
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -158,6 +159,7 @@ class _ClassReader:
         return None
 
 
+@lru_cache(maxsize=64)
 def _imports(source: ast.Module) -> dict[str, tuple[str, str]]:
     """Module and name (empty for a whole module) of what a source imports, by the name it gets."""
     found = {}

@@ -305,6 +305,48 @@ def _draw_bar(axes: Axes, estimate: Estimate, color: str, middle: float, high: f
         axes.vlines(marks, middle - 4, middle + 4, color=PALETTE["ink"], linewidth=1.4)
 
 
+def draw_leads(title: str, leads: Sequence[tuple[str, Estimate]], metric: str) -> Figure:
+    """Draw by how much a method is ahead of each other one: a bar, its 95 % interval, a number."""
+    facts = metric_facts(metric)
+    ends = [end for _, one in leads for end in (one.value, one.low, one.high) if end is not None]
+    low, high = min([*ends, 0.0]), max([*ends, 0.0])
+    margin, left, height = 0.03 * (high - low or 1.0), 145.0, 19.0 * len(leads)
+    with figure_style():
+        figure = new_figure(height + 46)
+        axes = add_axes(figure, left, 22, WIDTH - left - 50, height)
+        axes.set(xlim=(low - margin, high + margin), ylim=(len(leads), 0))
+        axes.axvline(0.0, color=PALETTE["ink"], linewidth=1)
+        _scale_across(axes)
+        for place, (label, estimate) in enumerate(leads):
+            middle = place + 0.5
+            surely = False
+            if estimate.low is not None and estimate.high is not None:
+                surely = not estimate.low <= 0.0 <= estimate.high
+                reach = estimate.low, estimate.high
+                axes.hlines(middle, *reach, color=PALETTE["ink"], linewidth=1.4, zorder=3)
+            color = PALETTE["s0" if estimate.value > 0 else "s1"]
+            axes.barh(middle, estimate.value, height=0.6, color=color, alpha=1.0 if surely else 0.4)
+            number = f"{estimate.value:+.{facts.digits}f}"
+            for text, at, side in ((label, 0.0, "right"), (number, 1.0, "left")):
+                axes.annotate(
+                    text, (at, middle), (-6 if at == 0 else 6, 0), ha=side, va="center",
+                    xycoords=axes.get_yaxis_transform(), textcoords="offset points",
+                )  # fmt: skip
+        unit = f" [{facts.unit}]" if facts.unit else ""
+        heading(axes, f"{title} ahead in {facts.label}{unit}, with 95 % intervals")
+    return figure
+
+
+def _scale_across(axes: Axes) -> None:
+    """Give axes round numbers below, and lines through them."""
+    from matplotlib.ticker import MaxNLocator
+
+    axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
+    axes.tick_params(axis="x", labelbottom=True, pad=4)
+    axes.grid(axis="x", color=PALETTE["line"], linewidth=0.7)
+    axes.set_axisbelow(True)
+
+
 def write_cost(folder: Path, analysis: CostAnalysis) -> list[Path]:
     """Write the tables of a cost analysis in every format, and its figure; returns the latter."""
     write_tables(folder / "tables", analysis.tables)
@@ -314,14 +356,18 @@ def write_cost(folder: Path, analysis: CostAnalysis) -> list[Path]:
 
 def write_figure(folder: Path, name: str, figure: Figure) -> list[Path]:
     """Write a figure on white as PNG and SVG; the same figure gives the same bytes."""
-    written = []
+    return [
+        atomic_write(folder / f"{name}.{ending}", figure_file(figure, ending)) for ending in ENDINGS
+    ]
+
+
+def figure_file(figure: Figure, ending: str) -> bytes:
+    """Return the content of a figure's file, on white, which a dark page shows too."""
+    stream = io.BytesIO()
+    metadata = {"Date": None} if ending == "svg" else {"Software": None}
     with figure_style(**{"svg.fonttype": "path"}):
-        for ending in ENDINGS:
-            stream = io.BytesIO()
-            metadata = {"Date": None} if ending == "svg" else {"Software": None}
-            figure.savefig(stream, format=ending, dpi=DPI, facecolor="white", metadata=metadata)
-            written.append(atomic_write(folder / f"{name}.{ending}", stream.getvalue()))
-    return written
+        figure.savefig(stream, format=ending, dpi=DPI, facecolor="white", metadata=metadata)
+    return stream.getvalue()
 
 
 def inline_svg(figure: Figure, title: str) -> Markup:

@@ -466,7 +466,8 @@ def environment() -> dict[str, Any]:
     """Return the versions, the processor and the system; no host name and no path.
 
     `code` is the digest of the toolkit's own modules, which a version number alone does not tell
-    while it is being developed. `caches` says what caches the methods began with.
+    while it is being developed, and `commit` that of a checkout. `caches` says what caches the
+    methods began with.
     """
     versions = {}
     for package in PACKAGES:
@@ -479,6 +480,7 @@ def environment() -> dict[str, Any]:
         "cores": len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count(),
         "packages": versions,
         "code": code_digest(),
+        "commit": packages.checkout_commit(),
         "caches": NEW_CACHES,
     }
 

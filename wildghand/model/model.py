@@ -396,13 +396,16 @@ class WildGHandModel(nn.Module):
         """
         rig, anchors, prediction = self.rigs[side], predicted.anchors, predicted.prediction
         pose, betas, transl = predicted.hand
+        behind = None
         if self.visibility is not None:
             bias = self.network.activation.log_scale_bias
             facing = None if viewmats is None else facing_of(anchors, viewmats)
+            behind = None if facing is None else self.visibility.behind(side, facing)
             settled = self.visibility.settle(side, prediction.raw, rig.spacing, bias, facing)
             prediction = replace(prediction, raw=settled)
         if self.color_changes is not None:
-            prediction = replace(prediction, raw=self.color_changes.color(side, prediction.raw))
+            colored = self.color_changes.color(side, prediction.raw, behind)
+            prediction = replace(prediction, raw=colored)
         prediction = dimmed(prediction, dark)
         if refine:
             step = prediction.refinement

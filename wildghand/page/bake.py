@@ -152,7 +152,7 @@ def hand_content(
     """
     model, settings = avatar.model, avatar.settings
     rig, network, wall = model.rigs[side], model.network, model.wall(side)
-    features = network.features(side)
+    features, behind = network.features(side), _unseen(avatar, side)
     betas = torch.as_tensor(avatar.betas[side], dtype=torch.float32).to(features.betas)
     steps, said = _sample(avatar, side, poses, features, tabled=tabled)
     shape = betas + features.betas if settings.heads else betas
@@ -167,8 +167,12 @@ def hand_content(
     else:
         raw = network.attributes_of_texture(side, features)
         if model.color_changes is not None:
-            raw = model.color_changes.color(side, raw)
+            raw = model.color_changes.color(side, raw, behind)
         base = raw.concatenate().cpu().numpy()
+    # What the skin of Gaussians that no frame shows changes where it faces the camera.
+    changes = np.zeros((count, 3))
+    if model.color_changes is not None:
+        changes = (model.color_changes.changes[side] * behind[:, None]).cpu().numpy()
     shifts = np.zeros((count, 3))
     if settings.heads:
         shifts = features.template_offsets.cpu().numpy()
@@ -187,6 +191,7 @@ def hand_content(
         mix = np.concatenate([mix, discs.mix])
         base = np.concatenate([base, discs.base])
         shifts = np.concatenate([shifts, discs.shifts])
+        changes = np.concatenate([changes, np.zeros((len(wall), 3))])
         # These are as they are: no frame is asked.
         kept = np.concatenate([kept, np.ones((len(wall), 2))])
     order = torch.argsort(template.weights, dim=1, descending=True)[:, :_JOINTS].cpu().numpy()
@@ -208,6 +213,7 @@ def hand_content(
         "base": pack_whole(base),
         "places": pack_whole(places),
         "shifts": pack_whole(shifts),
+        "changes": pack_whole(changes),
         # 0 is of skin that no frame shows.
         "kept": pack(np.where(kept > 0.0, np.rint(kept * 255.0).clip(min=1.0), 0.0).astype("u1")),
         "disc": _disc(avatar, side),
@@ -236,7 +242,7 @@ def _sample(
     """
     model, rig = avatar.model, avatar.model.rigs[side]
     betas = torch.as_tensor(avatar.betas[side], dtype=torch.float32).to(features.betas)
-    steps, said = [], []
+    steps, said, behind = [], [], _unseen(avatar, side)
     for part in torch.as_tensor(poses, dtype=torch.float32).to(betas).split(_CHUNK):
         anchors = rig.pose(part, betas, part.new_zeros(len(part), 3))
         made = model.predict(side, anchors, part, features)
@@ -244,11 +250,18 @@ def _sample(
         if tabled:
             raw = made.raw
             if model.color_changes is not None:
-                raw = model.color_changes.color(side, raw)
+                raw = model.color_changes.color(side, raw, behind)
             log = made.shadow.clamp(min=1e-4).log()
             said.append(torch.cat([raw.concatenate(), log], dim=-1).cpu().numpy())
     found = torch.cat(steps).cpu().numpy() if avatar.settings.heads else None
     return found, np.concatenate(said) if said else np.zeros((0, len(rig), CHANNELS + 1))
+
+
+def _unseen(avatar: WildGHandAvatar, side: str) -> torch.Tensor:
+    """(N,) 1 for Gaussians of skin that no frame shows, else 0; the page asks how they face."""
+    model = avatar.model
+    zeros = torch.zeros(len(model.rigs[side])).to(model.log_gains)
+    return zeros if model.visibility is None else model.visibility.behind(side, zeros)
 
 
 def _disc(avatar: WildGHandAvatar, side: str) -> list[float]:

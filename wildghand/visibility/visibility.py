@@ -81,9 +81,8 @@ class Visibility(Found):
         """
         kept, shape = self.offsets[side], self.shapes[side]
         if facing is not None:
-            behind = 1.0 - (facing / FACING).clamp(0.0, 1.0)
-            kept = torch.where(shape > 0.0, kept, behind)
-            shape = torch.where(shape > 0.0, shape, behind)
+            behind = self.behind(side, facing)
+            kept, shape = kept + behind, shape + behind
         kept, shape = kept[..., None], shape[..., None]
         disc = raw.log_scales.new_tensor([_WIDE, _WIDE, _THIN]).mul(spacing).log() - log_scale_bias
         # A quaternion and its negative turn alike: the one near the identity is the shorter way.
@@ -98,6 +97,15 @@ class Visibility(Found):
             logit_opacities=opaque + shape * (raw.logit_opacities - opaque),
             logit_colors=raw.logit_colors,
         )
+
+    def behind(self, side: str, facing: Tensor) -> Tensor:
+        """(B, N) in [0, 1], how far Gaussians of skin that no frame shows are as they were learnt.
+
+        Args:
+            facing: see `settle`.
+        """
+        unseen = (self.shapes[side] <= 0.0).to(facing)
+        return unseen * (1.0 - (facing / FACING).clamp(0.0, 1.0))
 
     def spare(self, chosen: Mapping[str, Tensor]) -> Visibility:
         """Keep all of some Gaussians.
@@ -209,6 +217,13 @@ class ColorChanges(Found):
     #: (N, 3) by side.
     changes: Annotated[Mapping[str, Tensor], Kept(("N", 3), -_LARGEST, _LARGEST, name="")]
 
-    def color(self, side: str, raw: RawAttributes) -> RawAttributes:
-        """Gaussians in their changed colours."""
-        return replace(raw, logit_colors=raw.logit_colors + self.changes[side])
+    def color(self, side: str, raw: RawAttributes, behind: Tensor | None = None) -> RawAttributes:
+        """Gaussians in their changed colours.
+
+        Args:
+            behind: (B, N) how far each is as it was learnt (`Visibility.behind`); None: not at all.
+        """
+        changes = self.changes[side]
+        if behind is not None:
+            changes = changes * (1.0 - behind)[..., None]
+        return replace(raw, logit_colors=raw.logit_colors + changes)

@@ -41,7 +41,7 @@ from hwp_bench.leaderboard.rules import (
     history,
     tables_of,
 )
-from hwp_bench.leaderboard.submit import add_entry
+from hwp_bench.leaderboard.submit import add_entries
 from hwp_bench.metrics import PROTOCOLS
 from hwp_bench.results import FrameResult, Results, write_results
 from hwp_bench.suites.suite import find_missing
@@ -240,12 +240,12 @@ def fit_results(make_results):
 
 def test_an_entry_is_the_whole_result(fit_results, tmp_path: Path) -> None:
     results = fit_results("plain")
-    file = add_entry(tmp_path, results)
+    (file,) = add_entries(tmp_path, [results])
     assert file.stem == entry_name(results)
     assert file.stem.startswith("plain-smoke-seed0-")
     assert [entry.results for entry in read_entries(tmp_path)] == [results]
-    add_entry(tmp_path, results)
-    add_entry(tmp_path, fit_results("mine", 22.0, budget={"seconds": 60, "steps": None}))
+    add_entries(tmp_path, [results])
+    add_entries(tmp_path, [fit_results("mine", 22.0, budget={"seconds": 60, "steps": None})])
     assert [entry.name.split("-seed")[0] for entry in read_entries(tmp_path)] == [
         "mine-smoke-60s",
         "plain-smoke",
@@ -254,14 +254,14 @@ def test_an_entry_is_the_whole_result(fit_results, tmp_path: Path) -> None:
 
 
 def test_a_changed_score_is_found(fit_results, tmp_path) -> None:
-    file = add_entry(tmp_path, fit_results())
+    (file,) = add_entries(tmp_path, [fit_results()])
     file.write_text(file.read_text().replace('"psnr": 20.0', '"psnr": 29.0'))
     with pytest.raises(BadResult, match="changed by hand"):
         read_entries(tmp_path)
 
 
 def test_other_names_and_fields_are_refused(fit_results, tmp_path) -> None:
-    file = add_entry(tmp_path, fit_results())
+    (file,) = add_entries(tmp_path, [fit_results()])
     moved = file.rename(tmp_path / "other.json")
     with pytest.raises(BadResult, match="must be called"):
         read_entries(tmp_path)
@@ -286,18 +286,18 @@ def test_other_names_and_fields_are_refused(fit_results, tmp_path) -> None:
 )
 def test_what_cannot_be_ranked_is_refused(fit_results, tmp_path, changes, problem) -> None:
     with pytest.raises(UsageError, match=problem):
-        add_entry(tmp_path, fit_results(**changes))
+        add_entries(tmp_path, [fit_results(**changes)])
     assert list(tmp_path.iterdir()) == []
 
 
 def test_other_data_in_one_suite_is_refused(fit_results, tmp_path) -> None:
-    add_entry(tmp_path, fit_results())
+    add_entries(tmp_path, [fit_results()])
     other = fit_results("mine")
     other = replace(other, captures=[replace(other.captures[0], digest="other")])
     with pytest.raises(UsageError, match="other captures, splits or test frames"):
-        add_entry(tmp_path, other)
+        add_entries(tmp_path, [other])
     # In another suite there is nothing that it would have to be like.
-    add_entry(tmp_path, with_keys(replace(other, suite="wild-test")))
+    add_entries(tmp_path, [with_keys(replace(other, suite="wild-test"))])
 
 
 def test_a_result_without_the_headline_metrics_is_refused(
@@ -305,7 +305,7 @@ def test_a_result_without_the_headline_metrics_is_refused(
 ) -> None:
     bare = replace(make_results(), protocols=fit_results().protocols)
     with pytest.raises(BadResult, match="lacks a headline metric"):
-        add_entry(tmp_path, bare)
+        add_entries(tmp_path, [bare])
 
 
 def test_the_entries_that_ship_are_sound() -> None:

@@ -30,7 +30,7 @@ from hwp_bench.leaderboard.rules import (
     register,
     sound_entries,
 )
-from hwp_bench.leaderboard.submit import add_entry
+from hwp_bench.leaderboard.submit import add_entries
 from hwp_bench.leaderboard.suite_data import (
     CaptureData,
     SuiteData,
@@ -134,7 +134,7 @@ FORGERIES: dict[str, tuple[Callable[[dict], object], str]] = {
 def honest(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """A folder with one honest entry, and its name; not to be changed."""
     folder = tmp_path_factory.mktemp("honest")
-    return folder, add_entry(folder, complete_results("plain")).stem
+    return folder, add_entries(folder, [complete_results("plain")])[0].stem
 
 
 @pytest.mark.parametrize("name", FORGERIES)
@@ -151,7 +151,7 @@ def test_a_forged_entry_is_refused_and_blocks_no_other(
     found = [entry.name for entry in sound_entries(tmp_path)]
     # A row that lacks captures is shown without a rank, as it says itself.
     assert found == sorted([honest[1], *([false.stem] if name == "a capture left out" else [])])
-    add_entry(tmp_path, complete_results("mine"))
+    add_entries(tmp_path, [complete_results("mine")])
 
 
 def test_keys_that_fit_do_not_hide_other_data(tmp_path: Path, capsys) -> None:
@@ -162,7 +162,7 @@ def test_keys_that_fit_do_not_hide_other_data(tmp_path: Path, capsys) -> None:
 
 def test_a_check_says_what_its_numbers_say(tmp_path: Path, capsys) -> None:
     entry = make_entry(complete_results())
-    add_entry(tmp_path, entry.results)
+    add_entries(tmp_path, [entry.results])
     command = ["leaderboard", "check", "--entries", str(tmp_path)]
     for check, wrong in (
         (check_of(entry), {"verdict": "differs"}),
@@ -317,8 +317,8 @@ def test_entries_on_data_that_were_rounded_otherwise_stand(
     data = _renewed(monkeypatch, rendered=True).suites["smoke"]
     captures = [replace(c, digest=data[c.id].versions[0].digest) for c in after.captures]
     after = with_keys(replace(after, captures=captures))
-    add_entry(tmp_path, before)
-    add_entry(tmp_path, after)
+    add_entries(tmp_path, [before])
+    add_entries(tmp_path, [after])
     assert on_current_data(before).captures[0].digest == "a" * 64
     assert on_current_data(after) == after
     methods = method_rows(sound_entries(tmp_path))
@@ -336,9 +336,9 @@ def test_a_suite_that_was_not_rendered_yet_binds_no_new_entry(
     before = complete_results("before")
     _renewed(monkeypatch, rendered=False)
     assert on_current_data(before) == before
-    add_entry(tmp_path / "old", before)
+    add_entries(tmp_path / "old", [before])
     captures = [replace(c, digest="c" * 64) for c in before.captures]
-    add_entry(tmp_path / "new", with_keys(replace(before, captures=captures)))
+    add_entries(tmp_path / "new", [with_keys(replace(before, captures=captures))])
     assert len(sound_entries(tmp_path / "old")) == len(sound_entries(tmp_path / "new")) == 1
 
 
@@ -360,7 +360,7 @@ def test_false_dates_are_refused(started: str, checked: str | None, problem: str
 
 
 def test_a_false_check_is_left_out_and_takes_no_row_away(tmp_path: Path, capsys) -> None:
-    file = add_entry(tmp_path, complete_results("mine"))
+    (file,) = add_entries(tmp_path, [complete_results("mine")])
     (entry,) = read_entries(tmp_path)
     for check in (
         replace(check_of(entry, "re-run"), date="2099-01-01T00:00:00+00:00"),

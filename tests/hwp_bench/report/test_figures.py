@@ -16,6 +16,7 @@ from hwp_bench.analysis.pairing import group_runs
 from hwp_bench.report.figures import (
     PALETTE,
     draw_bars,
+    draw_leads,
     draw_pareto,
     inline_svg,
     write_cost,
@@ -144,3 +145,19 @@ def test_files_have_a_legend_and_repeat_byte_for_byte(tmp_path: Path) -> None:
     title = figure.legends[0].get_title()
     assert title.get_text() == "Shaded bands are 95 % intervals over captures"
     assert write_figure(tmp_path, "again", figure)[1].read_bytes() == first.read_bytes()
+
+
+def test_leads_have_a_bar_from_zero_an_interval_and_a_number_each() -> None:
+    leads = [("A", estimate(2.0, 1.0, 4.0)), ("B", estimate(-1.0, -3.0, 0.5)), ("C", estimate(0.5))]
+    (axes,) = draw_leads("Mine", leads, "psnr").axes
+    bars = [(bar.get_x(), bar.get_width(), bar.get_alpha()) for bar in axes.patches]
+    # Pale where the interval contains 0, or there is none.
+    assert bars == [(0.0, 2.0, 1.0), (0.0, -1.0, 0.4), (0.0, 0.5, 0.4)]
+    whiskers = [np.ptp(lines.get_segments()[0][:, 0]) for lines in axes.collections]
+    assert whiskers == [3.0, 3.5]
+    texts = [text.get_text() for text in axes.texts]
+    assert {"A", "B", "C", "+2.00", "-1.00", "+0.50"} <= set(texts)
+    assert "Mine ahead in PSNR [dB], with 95 % intervals" in texts
+    low, high = axes.get_xlim()
+    assert low < -3.0
+    assert high > 4.0

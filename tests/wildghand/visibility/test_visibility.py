@@ -82,6 +82,18 @@ def test_skin_that_no_frame_shows_is_as_learnt_from_behind_and_discs_from_the_fr
     assert torch.equal(seen, some.settle("right", raw, SPACING, bias).concatenate())
 
 
+def test_unseen_skin_that_faces_away_keeps_the_colours_that_were_learnt() -> None:
+    # They shine through the skin that frames show.
+    raw, facing = raw_attributes(), torch.tensor([-0.5, 0.0, 0.05, 0.1, 0.9]).repeat(2, 8)
+    behind = visibility(0.0, 0.0).behind("right", facing)
+    expected = torch.tensor([1.0, 1.0, 0.5, 0.0, 0.0]).repeat(2, 8)
+    torch.testing.assert_close(behind, expected)
+    changes = ColorChanges({"right": torch.ones(40, 3)})
+    found = changes.color("right", raw, behind).logit_colors - raw.logit_colors
+    torch.testing.assert_close(found, (1.0 - expected)[..., None].expand_as(found))
+    assert not visibility(0.3, 0.3).behind("right", facing).any()
+
+
 def test_a_single_place_is_not_shown_and_the_rim_of_what_is_shown_is_free() -> None:
     # Places in a row, each the neighbour of the two on either side.
     row = torch.arange(30)

@@ -43,7 +43,7 @@ void main() {
   dark = vec4(pow(clamp(lit / whole, 0.15, 1.0), 1.0 / 2.2));
 }`;
 // Texels of a Gaussian: 0 corners and the first share; 1 second share, whether it is near a wrist's
-// border, what is kept of offset and shape; 2 to 5 attributes and uv; 6 place and mean weight; 7 shift, whether seen.
+// border, what is kept of offset and shape; 2 to 5 attributes and uv; 6 place and mean weight; 7 shift, whether seen; 8 change of the colour.
 const POSE = (P, H, first, second) => `${GLSL}
 layout(std140) uniform First { vec4 one[${first}]; };
 layout(std140) uniform Second { vec4 two[${second}]; };
@@ -55,9 +55,9 @@ uniform vec4 mixing[56], shift[4], fields[32]; uniform vec3 gain;
 uniform vec4 extra; uniform bool weighed, marked;
 out vec4 a, b, c, d;
 struct Place { vec3 at, normal, tangent; float dark; };
-ivec3 corners(int row) { return ivec3(texel(gaussians, 8 * row).xyz); }
+ivec3 corners(int row) { return ivec3(texel(gaussians, 9 * row).xyz); }
 vec3 shares(int row) {
-  float x = texel(gaussians, 8 * row).w, y = texel(gaussians, 8 * row + 1).x;
+  float x = texel(gaussians, 9 * row).w, y = texel(gaussians, 9 * row + 1).x;
   return vec3(x, y, 1.0 - x - y);
 }
 Place place(int row) {
@@ -84,7 +84,7 @@ vec4 raw[4]; float shadow;
 vec4 silu(vec4 x) { return x / (1.0 + exp(-x)); }
 // The geometry branch, and heads i and ii (wildghand/network), at one Gaussian with a normal.
 void ask(int row, vec3 n) {
-  int t = 8 * row, w = 0;
+  int t = 9 * row, w = 0;
   for (int i = 0; i < 4; i++) raw[i] = texel(gaussians, t + 2 + i);
   vec2 uv = raw[3].zw;
   harmonic(n);
@@ -154,8 +154,13 @@ void carryOn(int row, Place own) {
   harmonic(own.normal);
 }
 // wildghand/visibility: the nearer to a disc on the skin, the less frames say of a Gaussian.
-void settle(vec2 kept, float facing) {
-  if (kept.y <= 0.0) kept = vec2(1.0 - clamp(facing / 0.1, 0.0, 1.0));
+void settle(vec2 kept, float facing, vec3 change) {
+  if (kept.y <= 0.0) {
+    float front = clamp(facing / 0.1, 0.0, 1.0);
+    kept = vec2(1.0 - front);
+    raw[2].w += front * change.x;
+    raw[3].xy += front * change.yz;
+  }
   vec4 q = vec4(raw[1].zw, raw[2].xy);
   q = normalize(q) * (q.x < 0.0 ? -1.0 : 1.0);
   q = vec4(1, 0, 0, 0) + kept.y * (q - vec4(1, 0, 0, 0));
@@ -183,7 +188,7 @@ vec3 ramp(float share) {
   return mix(colors[low], colors[low + 1], share * 4.0 - float(low));
 }
 void main() {
-  int row = start + gl_VertexID, t = 8 * row;
+  int row = start + gl_VertexID, t = 9 * row;
   vec4 info = texel(gaussians, t + 7);
   Place own = place(row);
   // The discs in a wrist are as they are.
@@ -194,7 +199,8 @@ void main() {
   } else {
     askLit(row, own.normal);
     carryOn(row, own);
-    settle(texel(gaussians, t + 1).zw, dot(normalize(eye - own.at), own.normal));
+    float facing = dot(normalize(eye - own.at), own.normal);
+    settle(texel(gaussians, t + 1).zw, facing, texel(gaussians, t + 8).xyz);
     if (biased) perturb(row);
   }
   vec3 color = shadow * own.dark * gain / (1.0 + exp(-vec3(raw[2].w, raw[3].xy)));
@@ -318,14 +324,15 @@ class Gaussians {
   }
   // The texels of all Gaussians that no pose changes.
   static() {
-    const out = new Float32Array(32 * this.count);
+    const out = new Float32Array(36 * this.count);
     let row = 0, vertex = 0;
     for (const hand of this.hands) {
       const { data } = hand, corners = unpack(data.corners, Uint16Array), mix = unpack(data.mix, Uint16Array);
       const base = whole(data.base), places = whole(data.places), shifts = whole(data.shifts);
+      const changes = whole(data.changes);
       const kept = unpack(data.kept, Uint8Array), trusted = data.trusted && unpack(data.trusted, Uint8Array);
       Object.assign(hand, { first: row, firstVertex: vertex });
-      for (let n = 0, o = 32 * row; n < hand.count; n++, o += 32) {
+      for (let n = 0, o = 36 * row; n < hand.count; n++, o += 36) {
         const skin = n < hand.skin, k = kept[2 * n] / 255;
         for (let i = 0; i < 3; i++) out[o + i] = corners[3 * n + i] + vertex;
         const shares = [mix[2 * n] / 65535, mix[2 * n + 1] / 65535];
@@ -335,8 +342,9 @@ class Gaussians {
         // Of frames f and their half h a fit keeps k = f / (f + h); it has seen f / h.
         const weight = trusted && trusted[n] < 255 ? trusted[n] / 254 : 2;
         out.set([weight, ...shifts.subarray(3 * n, 3 * n + 3), Math.min(k / Math.max(1 - k, 1e-6), 1)], o + 27);
+        out.set(changes.subarray(3 * n, 3 * n + 3), o + 32);
       }
-      for (const n of data.lenders) out[32 * (row + n) + 5] = 1;
+      for (const n of data.lenders) out[36 * (row + n) + 5] = 1;
       row += hand.count;
       vertex += hand.vertices;
     }
@@ -467,7 +475,7 @@ class Gaussians {
   fill(hand, values) {
     const { data } = this.textures.gaussians;
     for (let n = 0; n < hand.skin; n++)
-      data.set(values.subarray(15 * n, 15 * n + 15), 32 * (hand.first + n) + 8);
+      data.set(values.subarray(15 * n, 15 * n + 15), 36 * (hand.first + n) + 8);
     this.upload(this.textures.gaussians, data);
   }
   // A frame's biases, all multiplied by omega; the part of the field that bones have, at the vertices.
