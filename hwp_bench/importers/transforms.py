@@ -5,7 +5,7 @@ backwards), and `fl_x`, `fl_y`, `cx`, `cy` in px, of its own or at the top of th
 centres lie at +0.5 in both formats. `applied_transform` (3, 4) and then `applied_scale` lead from
 the world of the data to that of the file, where z is up; a capture filmed upright has y down.
 
-The hands stand beside it in `hands.npz`, as a capture has them, in the world of the data (m). The
+The hands are next to it in `hands.npz`, as a capture has them, in the world of the data (m). The
 other facts of a capture are under the key `hwp`.
 
 Source: nerfstudio, `nerfstudio/data/dataparsers/nerfstudio_dataparser.py`.
@@ -17,7 +17,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 from msgspec import Meta
@@ -34,6 +34,8 @@ from hwp_bench.capture.splits import MIN_FRAMES, contiguous_split
 #: Name of the file.
 TRANSFORMS = "transforms.json"
 _SOURCE = {"kind": "transforms", "importer": {"name": "transforms", "version": 1}}
+_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+_PINHOLES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
 # Camera axes of OpenCV to those of OpenGL, and back; a world with y down to one with z up.
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 _UPRIGHT = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
@@ -42,7 +44,6 @@ _Number = Annotated[float, Meta(ge=-schema.LARGEST, le=schema.LARGEST)]
 _Rows = Annotated[
     Sequence[tuple[_Number, _Number, _Number, _Number]], Meta(min_length=3, max_length=4)
 ]
-_Zero = Annotated[float, Meta(ge=0.0, le=0.0, description="0: undistort the images first")]
 
 
 @dataclass(frozen=True)
@@ -58,13 +59,6 @@ class _Frame:
     fl_y: _Number
     cx: _Number
     cy: _Number
-    camera_model: Literal["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE"] = "OPENCV"
-    k1: _Zero = 0.0
-    k2: _Zero = 0.0
-    k3: _Zero = 0.0
-    k4: _Zero = 0.0
-    p1: _Zero = 0.0
-    p2: _Zero = 0.0
     applied_transform: _Rows = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
     applied_scale: Annotated[float, Meta(gt=0.0, le=schema.LARGEST)] = 1.0
 
@@ -86,7 +80,7 @@ def export_transforms(
 ) -> Path:
     """Write a capture as a folder that nerfstudio's default data parser reads.
 
-    It returns the path of `transforms.json`, beside `images/`, `masks/` and `hands.npz`. The file
+    It returns the path of `transforms.json`, next to `images/`, `masks/` and `hands.npz`. The file
     lists the split by the 80/10/10 rule. Truth and free-view clip are left out.
 
     Raises:
@@ -135,8 +129,7 @@ def import_transforms(
     hands, in metres. The frames keep the order of the file, as do the rows of `hands.npz`.
 
     Raises:
-        BadInput: a field is missing or wrong, a lens is distorted, a frame has no mask, or there
-            are no hands.
+        BadInput: a field is missing or wrong, a lens is distorted, or there is no mask or hand.
         UsageError: `out` exists.
     """
     file, out = place(source, "source"), place(out, "out")
@@ -149,6 +142,10 @@ def import_transforms(
         listed = [{**top, **one} if isinstance(one, dict) else one for one in listed]
     options: dict[str, Any] = {"where": file, "error": BadInput, "ignore_unknown": True}
     frames = parse_record(_File, {"frames": listed}, **options).frames
+    for one in listed:
+        if any(map(one.get, _DISTORTION)) or one.get("camera_model", "OPENCV") not in _PINHOLES:
+            remedy = "Undistort the images first: a capture has pinhole cameras."
+            raise BadInput("the lens is distorted", where=file, field="camera_model", remedy=remedy)
     size, hands_file = (int(frames[0].h), int(frames[0].w)), file.parent / schema.HANDS
     if not hands_file.is_file():
         remedy = "Write the pose of the hands there, as docs/data.md says."
@@ -167,7 +164,7 @@ def import_transforms(
     try:
         cameras = Cameras(np.array(Ks), np.stack([one.viewmat() for one in frames]))
     except (np.linalg.LinAlgError, BadInput) as error:
-        raise BadInput(f"a camera is no rigid pinhole ({error})", where=file) from error
+        raise BadInput(f"a camera is not a rigid pinhole ({error})", where=file) from error
     hands = schema.read_hands(hands_file, info.sides, len(frames))
     with CaptureWriter(out, info, hands, cameras, overwrite=overwrite) as writer:
         for number, one in enumerate(frames):

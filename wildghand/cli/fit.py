@@ -83,7 +83,7 @@ def add_fit(parser: argparse.ArgumentParser) -> None:
     live = "show the fit in the browser while it runs (needs viser); changes nothing of it"
     add("--live", action="store_true", help=live)
     add_address(parser)
-    log = "write curves and pictures of the fit for TensorBoard (needs tensorboard)"
+    log = "write curves of the fit for TensorBoard (needs tensorboard)"
     add("--tensorboard", type=Path, metavar="DIR", help=log)
     add_ending(parser, "avatar")
 

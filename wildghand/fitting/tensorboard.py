@@ -1,22 +1,16 @@
-"""A fit in TensorBoard: curves and pictures of a training frame, while it runs."""
+"""Curves of a fit in TensorBoard, while it runs."""
 
 from __future__ import annotations
 
 import contextlib
-import math
-import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from hwp_bench.base.packages import import_extra
+from wildghand.fitting.fit import Fit
 from wildghand.fitting.glance import LEAST_PAUSE, Glance, Live
 from wildghand.fitting.session import Watch
-
-# Seconds between two pictures; a curve has a point for every look.
-_PICTURES = 30.0
+from wildghand.gaussians.fit_loop import Loss
 
 
 @contextlib.contextmanager
@@ -33,24 +27,18 @@ def logging_fit(
         return
     problem = "tensorboard is not installed"
     writers = import_extra("torch.utils.tensorboard", "tensorboard", problem)
-    drawn = -math.inf
 
     def show(look: Glance) -> None:
-        nonlocal drawn
         writer.add_scalar("fit/loss", look.loss, look.step)
         writer.add_scalar("fit/psnr", look.psnr, look.step)
-        if time.monotonic() >= drawn + _PICTURES:
-            weights = np.repeat(look.weights[..., None], 3, axis=2)
-            sheet = np.concatenate([look.truth, look.avatar, weights], axis=1)
-            writer.add_image("fit/frame_avatar_weights", sheet, look.step, dataformats="HWC")
-            drawn = time.monotonic()
         writer.flush()
 
-    watches: list[Watch] = [*([watch] if watch else []), Live(show, pause=pause)]
+    live = Live(show, pause=pause)
 
-    def call(*looked: Any) -> None:
-        for one in watches:
-            one(*looked)
+    def call(fit: Fit, step: int, loss: Loss) -> None:
+        live(fit, step, loss)
+        if watch is not None:
+            watch(fit, step, loss)
 
     with contextlib.closing(writers.SummaryWriter(folder)) as writer:
         yield call

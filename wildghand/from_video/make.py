@@ -229,8 +229,7 @@ def fit(
         overwrite: replace an avatar that is there.
         side: of a video: `right`, `left`, `both` or `auto` (the default: one or both, as it shows).
         landmarks: of a video: its landmarks; None tracks them.
-        tensorboard: folder for curves and pictures of the fit, which `tensorboard --logdir` shows
-            while it runs; they change nothing of it.
+        tensorboard: folder for curves of the fit, which `tensorboard --logdir` shows while it runs.
 
     Returns:
         The avatar; `avatar.folder` is where it lies, and `wildghand.load_avatar` opens it again.

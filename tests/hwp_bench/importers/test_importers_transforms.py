@@ -129,10 +129,10 @@ def test_a_file_of_another_program_is_read(scene: Callable[..., Path], tmp_path:
     [
         (lambda c: c.update(frames=[]), "frames: .*expected a list of 1 to 100,000 entries"),
         (lambda c: c.update(frames=[3]), r"frames\[0\]: must be a table"),
-        (lambda c: c.update(k1=0.1), "k1: is 0.1, expected 0: undistort the images first"),
-        (lambda c: c.update(camera_model="FISHEYE"), "camera_model: is 'FISHEYE', expected one"),
+        (lambda c: c.update(k1=0.1), "camera_model: the lens is distorted"),
+        (lambda c: c.update(camera_model="FISHEYE"), "camera_model: the lens is distorted"),
         (lambda c: c.update(applied_scale=0), "applied_scale: is 0, expected a finite number"),
-        (lambda c: c.update(applied_transform=[[0.0] * 4] * 3), "no rigid pinhole"),
+        (lambda c: c.update(applied_transform=[[0.0] * 4] * 3), "not a rigid pinhole"),
         (lambda c: c.update(w="wide"), "w: is 'wide', expected a finite number"),
         (lambda c: c.update(w=25), "images/000000.png: .*24"),
         (lambda c: c["frames"][2].pop("fl_x"), r"frames\[2\].fl_x: is missing"),
