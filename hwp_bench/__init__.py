@@ -18,16 +18,22 @@ if TYPE_CHECKING:
     from hwp_bench.base.errors import HwpError as HwpError
     from hwp_bench.capture import Capture as Capture
     from hwp_bench.capture import open_capture as open_capture
+    from hwp_bench.importers.transforms import export_transforms as export_transforms
+    from hwp_bench.importers.transforms import import_transforms as import_transforms
+    from hwp_bench.methods.dataset import CaptureDataset as CaptureDataset
     from hwp_bench.results import Results as Results
     from hwp_bench.results import read_results as read_results
     from hwp_bench.sim.produce.capture import render_capture as render_capture
 
 _HOMES = {
     "Capture": "hwp_bench.capture",
+    "CaptureDataset": "hwp_bench.methods.dataset",
     "HwpError": "hwp_bench.base.errors",
     "Results": "hwp_bench.results",
     "compare": "hwp_bench.api",
     "evaluate": "hwp_bench.api",
+    "export_transforms": "hwp_bench.importers.transforms",
+    "import_transforms": "hwp_bench.importers.transforms",
     "open_capture": "hwp_bench.capture",
     "read_results": "hwp_bench.results",
     "render_capture": "hwp_bench.sim.produce.capture",

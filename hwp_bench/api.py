@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -16,6 +16,7 @@ import numpy as np
 from hwp_bench.analysis.compare import Comparison, compare_results
 from hwp_bench.base.console import JobsView, notice
 from hwp_bench.base.errors import UsageError, of_type, place, whole_number
+from hwp_bench.base.folders import scratch_folder
 from hwp_bench.capture import Capture
 from hwp_bench.evaluation.capture_evaluation import EvaluationSettings
 from hwp_bench.evaluation.evaluate import (
@@ -27,8 +28,9 @@ from hwp_bench.evaluation.evaluate import (
 )
 from hwp_bench.evaluation.evaluate import evaluate as evaluate_method
 from hwp_bench.evaluation.sentences import outcome_lines
-from hwp_bench.methods.contract import RunSettings
+from hwp_bench.methods.contract import MethodFactory, RunSettings
 from hwp_bench.methods.manifest import find_method, read_manifest
+from hwp_bench.methods.source import write_method
 from hwp_bench.metrics.score import score_frame
 from hwp_bench.report.tables import HEADLINE
 from hwp_bench.results import Results, read_all
@@ -44,7 +46,7 @@ Captures: TypeAlias = (
 
 
 def evaluate(
-    method: str | os.PathLike[str],
+    method: str | os.PathLike[str] | MethodFactory,
     captures: Captures = "mini",
     out: str | os.PathLike[str] | None = None,
     *,
@@ -63,7 +65,11 @@ def evaluate(
     are. Before the first capture the method is made once with its settings.
 
     Args:
-        method: method directory, or the name of one that ships: `plain`, `wildghand`.
+        method: method directory; the name of one that ships (`plain`, `wildghand`) or that is
+            installed; or a class or function that is called with `settings` and `seed` and returns
+            a `hwp_bench.methods.Method`. Its source, with what it uses of its own file or
+            notebook, becomes a method directory for this call: it runs in a process of its own and
+            sees none of the variables that are set elsewhere.
         captures: a suite (`smoke`, `mini`, `full`, `wild-dev`, `persistent`, `real-1`; rendered
             or imported on first use), a capture or its folder, or a list of these.
         out: results folder; `runs/METHOD-SUITE` if None, with the oracle's name, the budget and
@@ -91,26 +97,31 @@ def evaluate(
             lies in the method or in a capture, or holds results of another evaluation.
         HwpError: another evaluation is writing to `out`, or `out` cannot be written.
     """
-    method = os.fspath(place(method, "method"))
-    suite = captures if isinstance(captures, str) and captures in SUITES else "captures"
-    given = _folders(captures) if suite == "captures" else []
-    of_type(preset, (str, type(None)), "preset", "a text")
-    of_type(settings, (Mapping, type(None)), "settings", "a table of settings by name")
-    if whole_number(jobs, "jobs") < 1:
-        raise UsageError(f"is {jobs}", field="jobs", remedy="Use 1 or more.")
-    plan = EvaluationSettings(
-        suite=suite,
-        preset=preset,
-        run=RunSettings(dict(settings or {}), seed, make_budget(seconds, steps), frames),
-    )
-    folder = place(out, "out") if out is not None else default_folder(method, plan)
-    manifest = read_manifest(find_method(method))
-    check_results_place(manifest, folder, {"captures": given}, "out")
-    check_call(manifest, plan, folder, overwrite=overwrite)
-    rehearsed = suite != "captures" and check_suite(manifest, plan, folder)
-    view = JobsView()
-    engine: Engine = LocalEngine() if jobs == 1 else ParallelEngine(jobs, view)
-    with engine, view if engine.in_turn else nullcontext():
+    with ExitStack() as stack:
+        if callable(method):
+            method = write_method(method, stack.enter_context(scratch_folder("hwp-method-")))
+        method = os.fspath(place(method, "method"))
+        suite = captures if isinstance(captures, str) and captures in SUITES else "captures"
+        given = _folders(captures) if suite == "captures" else []
+        of_type(preset, (str, type(None)), "preset", "a text")
+        of_type(settings, (Mapping, type(None)), "settings", "a table of settings by name")
+        if whole_number(jobs, "jobs") < 1:
+            raise UsageError(f"is {jobs}", field="jobs", remedy="Use 1 or more.")
+        plan = EvaluationSettings(
+            suite=suite,
+            preset=preset,
+            run=RunSettings(dict(settings or {}), seed, make_budget(seconds, steps), frames),
+        )
+        folder = place(out, "out") if out is not None else default_folder(method, plan)
+        manifest = read_manifest(find_method(method))
+        check_results_place(manifest, folder, {"captures": given}, "out")
+        check_call(manifest, plan, folder, overwrite=overwrite)
+        rehearsed = suite != "captures" and check_suite(manifest, plan, folder)
+        view = JobsView()
+        engine: Engine = LocalEngine() if jobs == 1 else ParallelEngine(jobs, view)
+        stack.enter_context(engine)
+        if engine.in_turn:
+            stack.enter_context(view)
         paths = ensure_suite(suite, engine=engine) if suite != "captures" else given
         results = evaluate_method(
             method,

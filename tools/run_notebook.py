@@ -10,10 +10,14 @@ from __future__ import annotations
 
 import argparse
 import ast
+import base64
 import contextlib
 import io
 import json
+import linecache
 import os
+import sys
+import types
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -35,6 +39,8 @@ def run_cell(source: str, names: dict[str, Any], title: str) -> tuple[str, Any]:
     Returns:
         What it prints, and the value of its last line (None where that is not an expression).
     """
+    # As IPython does: the source of a class of the cell can be found.
+    linecache.cache[title] = (len(source), None, source.splitlines(keepends=True), title)
     tree = ast.parse(source, title)
     last = tree.body.pop() if tree.body and isinstance(tree.body[-1], ast.Expr) else None
     printed = io.StringIO()
@@ -52,8 +58,13 @@ def outputs_of(printed: str, value: Any, count: int) -> list[dict[str, Any]]:
     if printed:
         outputs.append({"output_type": "stream", "name": "stdout", "text": printed})
     if value is not None:
-        bundle = getattr(value, "_repr_mimebundle_", None)
-        data = bundle() if bundle is not None else {"text/plain": repr(value)}
+        data: dict[str, Any] = {"text/plain": repr(value)}
+        if hasattr(value, "_repr_mimebundle_"):
+            data = value._repr_mimebundle_()
+        elif hasattr(value, "_repr_png_"):
+            data["image/png"] = base64.b64encode(value._repr_png_()).decode()
+        elif hasattr(value, "_repr_html_"):
+            data["text/html"] = value._repr_html_()
         outputs.append(
             {
                 "output_type": "execute_result",
@@ -72,13 +83,19 @@ def run_notebook(notebook: dict[str, Any], changes: Mapping[str, Any] | None = N
         notebook: as its JSON; changed.
         changes: names that are set after the cell with the tag `parameters`.
     """
-    names: dict[str, Any] = {"__name__": "__main__"}
-    for count, cell in enumerate(code_cells(notebook), start=1):
-        printed, value = run_cell("".join(cell["source"]), names, f"cell {count}")
-        if "parameters" in cell["metadata"].get("tags", ()):
-            names.update(changes or {})
-        cell["execution_count"] = count
-        cell["outputs"] = outputs_of(printed, value, count)
+    before, main_module = sys.modules["__main__"], types.ModuleType("__main__")
+    sys.modules["__main__"] = main_module
+    names = vars(main_module)
+    try:
+        for count, cell in enumerate(code_cells(notebook), start=1):
+            title = f"<cell {count} of {id(main_module)}>"
+            printed, value = run_cell("".join(cell["source"]), names, title)
+            if "parameters" in cell["metadata"].get("tags", ()):
+                names.update(changes or {})
+            cell["execution_count"] = count
+            cell["outputs"] = outputs_of(printed, value, count)
+    finally:
+        sys.modules["__main__"] = before
 
 
 def main() -> None:

@@ -67,3 +67,4 @@ _.hidden_deviation  # the table CUES names it; getattr reads it
 _.memo  # pickle.Unpickler reads it
 REACH_X  # a row of the rasterizer's records, named for the order of the rows
 _.thread_type  # the decoder reads how it may share its work
+to_frame  # people call it in notebooks

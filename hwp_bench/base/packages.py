@@ -10,7 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from hwp_bench.base.errors import HwpError
+from hwp_bench.base.errors import HwpError, MissingDependency
 
 __version__ = "0.1.0"
 
@@ -32,6 +32,19 @@ def data_folder(name: str) -> Path:
         where=PACKAGES,
         remedy="Install the toolkit again.",
     )
+
+
+def import_extra(module: str, extra: str, problem: str) -> Any:
+    """Import a module that an extra of the toolkit brings.
+
+    Raises:
+        MissingDependency: it is not installed; `problem` says so.
+    """
+    try:
+        return import_module(module)
+    except ImportError as error:
+        remedy = f"pip install 'hwp-bench[{extra}]'"
+        raise MissingDependency(problem, remedy=remedy) from error
 
 
 @cache

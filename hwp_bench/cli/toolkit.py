@@ -72,7 +72,7 @@ def _suites() -> Table:
 
 
 def _methods() -> Table:
-    from hwp_bench.methods.manifest import shipped_methods
+    from hwp_bench.methods.manifest import installed_methods, shipped_methods
 
     rows = [
         (
@@ -86,12 +86,12 @@ def _methods() -> Table:
             method.url or "-",
             method.description,
         )
-        for method in shipped_methods()
+        for method in [*shipped_methods(), *installed_methods()]
     ]
     titles = (
         "method, title, presets, switches, authors, licence, validation frames, url, description"
     )
-    return named_table("Methods that ship with the toolkit", titles, rows)
+    return named_table("Methods that ship with the toolkit or are installed", titles, rows)
 
 
 def _validation(uses: Sequence[str] | None) -> str:

@@ -29,7 +29,7 @@ from hwp_bench.evaluation.scoring import (
 )
 from hwp_bench.methods.contents import digest_of, exposed_digest, method_files
 from hwp_bench.methods.contract import FRAME_CHOICES, RunSettings
-from hwp_bench.methods.manifest import MethodManifest, read_manifest
+from hwp_bench.methods.manifest import MethodManifest, read_manifest, ships
 from hwp_bench.methods.request import write_request
 from hwp_bench.metrics import METRICS, PROTOCOLS
 from hwp_bench.metrics.lpips import load_available
@@ -120,7 +120,8 @@ class CaptureEvaluation:
         Another process or machine opens method and capture itself.
         """
         root = self.manifest.root.resolve()
-        shipped = root.relative_to(PACKAGES).as_posix() if root.is_relative_to(PACKAGES) else None
+        # An installed method may lie next to our packages, but is not a part of them.
+        shipped = root.relative_to(PACKAGES).as_posix() if ships(root) else None
         inputs = {"capture": Folder(self.capture.root, (EXTRA,))}
         if shipped is None:
             inputs["method"] = Folder(root)

@@ -1,1 +1,1 @@
-"""Captures from elsewhere: a video with tracked landmarks, the official release, InterHand2.6M."""
+"""Captures from elsewhere: videos, the official release, InterHand2.6M, transforms.json."""

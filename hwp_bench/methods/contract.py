@@ -33,6 +33,7 @@ from hwp_bench.capture.splits import Split
 from hwp_bench.hands.skeleton import Camera, HandParameters, HandPose, hand_poses
 
 if TYPE_CHECKING:
+    from hwp_bench.hands.skinning import PosedHand
     from hwp_bench.hands.template import HandTemplate
 
 #: Name of the file that describes a request folder.
@@ -225,6 +226,7 @@ class TrainingCapture:
                 read_cameras(root / FREE_VIEW / CAMERAS, record.free_view),
             )
         self._own_template = record.own_template
+        self._templates: dict[str, HandTemplate] = {}
         self._train = np.array(record.train, dtype=np.int64)
         if not np.isin(self._train, self.split.train).all():
             raise BadInput(
@@ -275,6 +277,38 @@ class TrainingCapture:
     def camera(self, frame: int) -> Camera:
         """Return the camera of one frame."""
         return self.cameras.camera(frame, self.width, self.height)
+
+    def vertices(self, frame: int | Mapping[str, HandPose]) -> dict[str, np.ndarray]:
+        """Return the vertices of the posed hands, (V, 3) float64 m, by side.
+
+        They are in the world of `camera`; `template(side).faces` connects them. `frame` is the
+        index of any frame, of which every hand is returned that the frame shows
+        (`hands[side].valid`); or it is poses by side, as `Avatar.render` is given them.
+        """
+        return {side: hand.vertices[0].numpy() for side, hand in self._posed(frame).items()}
+
+    def joints(self, frame: int | Mapping[str, HandPose]) -> dict[str, np.ndarray]:
+        """Return the joints of the posed hands, (16, 3) float64 m, by side, as `vertices` does.
+
+        `hwp_bench.hands.skeleton.JOINT_NAMES` names the rows.
+        """
+        return {side: hand.joints[0].numpy() for side, hand in self._posed(frame).items()}
+
+    def _posed(self, frame: int | Mapping[str, HandPose]) -> dict[str, PosedHand]:
+        from hwp_bench.hands.skinning import pose_parameters
+
+        if isinstance(frame, Mapping):
+            hands = frame
+        else:
+            shown = {side for side, hand in self.hands.items() if hand.valid[frame]}
+            hands = {side: hand for side, hand in self.hand_poses(frame).items() if side in shown}
+        posed = {}
+        for side, hand in hands.items():
+            if side not in self._templates:
+                self._templates[side] = self.template(side)
+            arrays = (hand.pose[None], hand.betas, hand.transl[None], np.ones(1, bool))
+            posed[side] = pose_parameters(self._templates[side], HandParameters(*arrays))
+        return posed
 
     def template(self, side: str) -> HandTemplate:
         """Load the hand template of one side.

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import itertools
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any
 
 from msgspec import Meta
 
 from hwp_bench.base.console import notice
-from hwp_bench.base.errors import BadMethod, UsageError, nearest
+from hwp_bench.base.errors import BadInput, BadMethod, UsageError, nearest
 from hwp_bench.base.files import inside
 from hwp_bench.base.packages import PACKAGES, data_folder
 from hwp_bench.base.records import (
@@ -33,6 +35,8 @@ from hwp_bench.taxonomy import SIZED_LIKE
 SCHEMA = "hwp-method/1"
 #: Name of the file that makes a folder a method directory.
 MANIFEST = "method.toml"
+#: Group of entry points in which an installed package names the packages of its methods.
+ENTRY_POINTS = "hwp_bench.methods"
 #: Largest `method.toml`, in bytes.
 MAX_BYTES = 64 * 1024
 #: Preset that is used when none is asked for.
@@ -262,10 +266,11 @@ class MethodManifest(ManifestFields):
 
 
 def find_method(text: str) -> Path:
-    """Find a method directory by path, or by the name of one that ships with the toolkit.
+    """Find a method directory by path, or by the name of one that ships or is installed.
 
     Args:
-        text: a path such as `my_method/`; or `plain`, `baselines/plain`, `wildghand`.
+        text: a path such as `my_method/`; `plain`, `baselines/plain`, `wildghand`; or the name of
+            an entry point `hwp_bench.methods`.
 
     Raises:
         BadMethod: there is no such directory.
@@ -276,16 +281,40 @@ def find_method(text: str) -> Path:
     for folder in _shipped_folders():
         if folder.name == name:
             return folder
+    if installed := _installed_folders().get(text):
+        return installed
     raise BadMethod(
         f"is not a method directory: it has no {MANIFEST}",
         where=text,
-        remedy="`hwp-bench list methods` shows the ones that ship with the toolkit.",
+        remedy="`hwp-bench list methods` shows the ones that ship or are installed.",
     )
 
 
 def shipped_methods() -> list[MethodManifest]:
     """Return the methods that ship with the toolkit: the reference method and the baselines."""
     return [read_manifest(folder) for folder in _shipped_folders()]
+
+
+def installed_methods() -> list[MethodManifest]:
+    """Return the methods of installed packages; a faulty one is left out, and said."""
+    found = []
+    for name, folder in _installed_folders().items():
+        try:
+            found.append(replace(read_manifest(folder), name=name))
+        except BadInput as error:
+            notice(f"left out: {error}")
+    return found
+
+
+def _installed_folders() -> dict[str, Path]:
+    """Folders of the packages that entry points name; nothing of them is imported."""
+    found, shipped = {}, {folder.name for folder in _shipped_folders()}
+    for point in metadata.entry_points(group=ENTRY_POINTS):
+        top, *below = point.module.split(".")
+        spec = importlib.util.find_spec(top)
+        if spec and spec.submodule_search_locations and point.name not in shipped:
+            found[point.name] = Path(spec.submodule_search_locations[0], *below)
+    return found
 
 
 def _shipped_folders() -> list[Path]:

@@ -14,7 +14,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import metadata
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from msgspec import Meta
 
@@ -25,6 +25,9 @@ from hwp_bench.base.records import Count, Digest, Line, Message, Seconds, Seed
 from hwp_bench.base.tables import Table
 from hwp_bench.metrics import METRICS
 from hwp_bench.metrics.score import CaptureScores, Scores, aggregate
+
+if TYPE_CHECKING:
+    import pandas
 
 #: Largest result file that is read, bytes; one of 10,000 frames stays far below it.
 MAX_BYTES = 64 << 20
@@ -278,6 +281,26 @@ class Results:
             *([f"{failed} failed frames"] if failed else []),
         ]
         return f"Results({', '.join(parts)})"
+
+    def to_frame(self, *, free_view: bool = False) -> pandas.DataFrame:
+        """Return the scores as a table of pandas with a row for each test frame.
+
+        Its columns are `method`, `suite`, `seed`, `capture`, `frame`, one for each metric, and
+        `failure`. `free_view` takes the frames of the free-view clips instead. Tables of several
+        results are joined by `pandas.concat`.
+
+        Raises:
+            MissingDependency: pandas is not installed.
+        """
+        frames = packages.import_extra("pandas", "pandas", "pandas is not installed")
+        head = {"method": self.method.title, "suite": self.suite, "seed": self.seed}
+        parts = [(item.id, item.free_view if free_view else item) for item in self.captures]
+        rows = [(name, one) for name, part in parts for one in (part.frames if part else ())]
+        table: pandas.DataFrame = frames.DataFrame(
+            {**head, "capture": name, "frame": one.frame, **one.scores, "failure": one.failure}
+            for name, one in rows
+        )
+        return table
 
     @property
     def drawn(self) -> bool:

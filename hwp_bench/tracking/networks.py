@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import importlib
 import math
 import os
 import tempfile
@@ -26,8 +25,9 @@ from typing import IO, Any
 import numpy as np
 
 from hwp_bench.base.download import Opener, Pinned, download
-from hwp_bench.base.errors import BadInput, HwpError, MissingDependency
+from hwp_bench.base.errors import BadInput, HwpError
 from hwp_bench.base.files import atomic_write, cache_root, check_is_file
+from hwp_bench.base.packages import import_extra
 
 # --- Rotated regions of an image
 
@@ -491,13 +491,8 @@ class LiteRtNetworks:
     """MediaPipe's networks: they find palms, and the landmarks of a hand."""
 
     def __init__(self, models: HandModels) -> None:
-        try:
-            runtime: Any = importlib.import_module("ai_edge_litert.interpreter")
-        except ImportError as error:
-            raise MissingDependency(
-                "ai-edge-litert is not installed, which runs the networks of the hand tracker",
-                remedy="pip install 'hwp-bench[track]'",
-            ) from error
+        problem = "ai-edge-litert is not installed, which runs the networks of the hand tracker"
+        runtime = import_extra("ai_edge_litert.interpreter", "track", problem)
         palm_outputs: list[tuple[int, ...]] = [(1, ANCHOR_COUNT, PALM_VALUES), (1, ANCHOR_COUNT, 1)]
         hand_outputs: list[tuple[int, ...]] = [(1, 63), (1, 1), (1, 1), (1, 63)]
         self._palm = _Network(runtime, models.palm, models.source, PALM_EDGE, palm_outputs)

@@ -103,6 +103,45 @@ def test_evaluate_takes_captures_and_folders_and_resumes(
         hwp_bench.evaluate("plain", "mini", settings={"stps": 3})
 
 
+class Gray:
+    """The method of `METHOD`, as a class of this file."""
+
+    def __init__(self, settings, seed):
+        self.gray = settings["gray"]
+
+    def fit(self, training, budget, report):
+        report(0, self)
+        return self
+
+    def render(self, hands, camera):
+        return np.full((camera.height, camera.width, 4), self.gray, np.float32)
+
+
+def make_gray(settings, seed):
+    return Gray(settings, seed)
+
+
+def test_a_class_or_function_scores_as_the_same_method_in_a_directory(
+    gray_method: Path, make_capture: CaptureMaker, tmp_path: Path
+) -> None:
+    capture, settings = make_capture(frames=20, size=48), {"gray": 0.25}
+    expected = hwp_bench.evaluate(gray_method, capture, tmp_path / "directory", settings=settings)
+    for factory in (Gray, make_gray):
+        out = tmp_path / factory.__name__
+        found = hwp_bench.evaluate(factory, capture, out, settings=settings)
+        assert found.method.name == factory.__name__
+        (one,), (other,) = found.captures, expected.captures
+        assert (one.frames, one.predictions_digest) == (other.frames, other.predictions_digest)
+        assert one.isolation == other.isolation
+        # The same source is the same method, so that what is finished is taken as it is.
+        again = hwp_bench.evaluate(factory, capture, out, settings=settings)
+        assert again.captures == found.captures
+    with pytest.raises(hwp_bench.HwpError, match="cannot be made: KeyError: 'gray'"):
+        hwp_bench.evaluate(Gray, capture, tmp_path / "fails")
+    with pytest.raises(hwp_bench.HwpError, match="not a class or function at the top level"):
+        hwp_bench.evaluate(lambda settings, seed: None, capture)
+
+
 def test_a_table_that_is_given_in_part_keeps_the_rest(
     gray_method: Path, make_capture: CaptureMaker, tmp_path: Path
 ) -> None:

@@ -14,6 +14,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import hwp_bench
+
 ROOT = Path(__file__).resolve().parents[2]
 NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
 #: Most bytes of a notebook with what its cells have shown.
@@ -76,3 +78,25 @@ def test_the_notebook_of_the_avatar_runs(tmp_path: Path, monkeypatch: pytest.Mon
     assert "Use -47 to 82" in cells["refused"]["outputs"][0]["text"]
     (score,) = re.findall(r"PSNR ([\d.]+) dB", cells["frame"]["outputs"][0]["text"])
     assert float(score) > 10.0
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("machine_code")
+def test_the_notebook_of_a_method_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    stored = json.loads((ROOT / "docs" / "notebooks" / "method.ipynb").read_text("utf-8"))
+    ran, before = copy.deepcopy(stored), sys.modules["__main__"]
+    run_notebook(ran, {"FRAMES": 20, "SIZE": 64, "STEPS": 20})
+    assert sys.modules["__main__"] is before
+    cells = {cell["id"]: cell["outputs"] for cell in code_cells(ran)}
+    for cell in code_cells(stored):
+        found = [out["output_type"] for out in cells[cell["id"]]]
+        assert found == [out["output_type"] for out in cell["outputs"]]
+    # The class of the notebook has run in the sandbox, and drew a hand rather than grey.
+    results = [hwp_bench.read_results(f"demo/{name}") for name in ("mine", "plain")]
+    assert [one.captures[0].failure for one in results] == [None, None]
+    assert results[0].scores["psnr"] > 15.0
+    table = "".join(cells["frame"][0]["data"]["text/html"])
+    assert all(one.method.title in table for one in results)
+    assert "image (8, 64, 64, 3)" in cells["batch"][0]["text"]
+    assert re.match(r"step 1: [\d.]+ dB, step \d+: ", cells["curves"][0]["text"])

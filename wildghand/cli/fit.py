@@ -19,22 +19,26 @@ from wildghand.cli.options import (
 
 if TYPE_CHECKING:
     from wildghand.fitting.parallel import World
+    from wildghand.fitting.session import Watch
     from wildghand.from_video import MadeAvatar
-    from wildghand.viewer.live import ServedFit
 
 
 @contextlib.contextmanager
-def watching(args: argparse.Namespace, *, shown: bool) -> Iterator[ServedFit | None]:
-    """Serve the page of a fit while the block runs, if it is `shown`."""
-    if not shown:
-        yield None
-        return
+def watching(args: argparse.Namespace, world: World) -> Iterator[tuple[Watch | None, Any]]:
+    """Yield who is shown the fit and its import while the block runs: a page, TensorBoard."""
     from hwp_bench.base.console import notice
-    from wildghand.viewer.live import serve_fit
+    from wildghand.fitting.tensorboard import logging_fit
 
-    with serve_fit(address_of(args)) as served:
-        notice(f"The fit is shown at {served.url}")
-        yield served
+    watch = glimpse = None
+    with contextlib.ExitStack() as stack:
+        if args.live and world.is_main:
+            from wildghand.viewer.live import serve_fit
+
+            served = stack.enter_context(serve_fit(address_of(args)))
+            notice(f"The fit is shown at {served.url}")
+            watch, glimpse = served.watch, served.glimpse
+        log = args.tensorboard if world.is_main else None
+        yield stack.enter_context(logging_fit(log, watch)), glimpse
 
 
 _FIT_EXAMPLES = """examples:
@@ -78,6 +82,8 @@ def _add_fit(parser: argparse.ArgumentParser) -> None:
     live = "show the fit in the browser while it runs (needs viser); changes nothing of it"
     add("--live", action="store_true", help=live)
     add_address(parser)
+    log = "write curves of the fit for TensorBoard (needs tensorboard)"
+    add("--tensorboard", type=Path, metavar="DIR", help=log)
     add_ending(parser, "avatar")
 
 
@@ -96,6 +102,7 @@ def _do_fit(args: argparse.Namespace) -> int:
         "--prior": args.prior,
     }
     check_places({"--out": args.out}, inputs, replaces=args.overwrite)
+    check_places({"--tensorboard": args.tensorboard}, inputs)
     work = _video if is_video(args.source) else _capture
     return run_in_world(
         lambda: choose_device(read_settings(_settings(args)).device),
@@ -118,15 +125,15 @@ def _video(args: argparse.Namespace, world: World) -> int:
         seed=args.seed,
         settings=_settings(args),
     )
-    with watching(args, shown=args.live and world.is_main) as served:
+    with watching(args, world) as (watch, glimpse):
         made = make_avatar(
             args.source,
             args.out,
             options,
             overwrite=args.overwrite,
             world=world,
-            watch=None if served is None else served.watch,
-            glimpse=None if served is None else served.glimpse,
+            watch=watch,
+            glimpse=glimpse,
         )
     if world.is_main:
         print_json(made.facts()) if args.json else _print(made)
@@ -165,7 +172,7 @@ def _capture(args: argparse.Namespace, world: World) -> int:
     if args.budget is not None and not args.budget > 0.0:
         raise UsageError(f"is {args.budget}", field="--budget", remedy="Use more than 0.")
     check_fitting(args)
-    with watching(args, shown=args.live and world.is_main) as served:
+    with watching(args, world) as (watch, _):
         avatar = fit_capture(
             args.source,
             args.out,
@@ -175,7 +182,7 @@ def _capture(args: argparse.Namespace, world: World) -> int:
             all_frames=args.all_frames is True,
             overwrite=args.overwrite,
             world=world,
-            watch=None if served is None else served.watch,
+            watch=watch,
         )
     if not world.is_main:
         return 0

@@ -6,15 +6,22 @@ Looking changes nothing: a fit that is watched gives the same bits as one that i
 from __future__ import annotations
 
 import math
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
+from hwp_bench.base.console import notice
 from hwp_bench.base.images import as_uint8
 from wildghand.fitting.fit import Fit, StepBatch
 from wildghand.fitting.weights import Pao
+from wildghand.gaussians.fit_loop import Loss
 from wildghand.splat.threads import denormals_flushed
+
+#: Least seconds between two pictures, and the largest share of the time that goes into them.
+LEAST_PAUSE, SHARE = 1.0, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,3 +79,36 @@ def _psnr(image: np.ndarray, truth: np.ndarray, hand: np.ndarray) -> float:
         return math.nan
     error = float(np.square(image[hand] - truth[hand] / 255.0).mean())
     return -10.0 * math.log10(max(error, 1e-10))
+
+
+class Live:
+    """Looks at a fit now and then; see `wildghand.fitting.session.Watch`.
+
+    Args:
+        show: takes what was seen.
+        wanted: whether anybody looks.
+        row: which training frame is looked at.
+        pause: seconds between two looks at least; 0 looks after every step.
+    """
+
+    def __init__(
+        self,
+        show: Callable[[Glance], None],
+        wanted: Callable[[], bool] = lambda: True,
+        row: Callable[[int], int] = lambda count: 0,
+        pause: float = LEAST_PAUSE,
+    ) -> None:
+        self._show, self._wanted, self._row, self._pause = show, wanted, row, pause
+        self._due = 0.0
+
+    def __call__(self, fit: Fit, step: int, loss: Loss) -> None:
+        """Look, where it is time to."""
+        began = time.monotonic()
+        if began < self._due or not self._wanted():
+            return
+        try:
+            self._show(glance(fit, self._row(len(fit.data.frames)), step, float(loss)))
+        except OSError as error:  # the network's: a page that is gone must not end a fit
+            notice(f"The fit cannot be shown ({error}).")
+        now = time.monotonic()
+        self._due = now + max(self._pause, (now - began) * (1.0 / SHARE - 1.0) * bool(self._pause))

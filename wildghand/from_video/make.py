@@ -24,6 +24,7 @@ from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import DESCRIPTION, load_avatar
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
 from wildghand.fitting.session import Watch, fit_capture
+from wildghand.fitting.tensorboard import logging_fit
 from wildghand.from_video.run import (
     FRAMES,
     JobRecord,
@@ -206,6 +207,7 @@ def fit(
     overwrite: bool = False,
     side: str | None = None,
     landmarks: str | os.PathLike[str] | None = None,
+    tensorboard: str | os.PathLike[str] | None = None,
 ) -> WildGHandAvatar:
     """Fit an avatar to a video or to a capture, as `wildghand fit` does.
 
@@ -227,6 +229,7 @@ def fit(
         overwrite: replace an avatar that is there.
         side: of a video: `right`, `left`, `both` or `auto` (the default: one or both, as it shows).
         landmarks: of a video: its landmarks; None tracks them.
+        tensorboard: folder for curves of the fit, which `tensorboard --logdir` shows while it runs.
 
     Returns:
         The avatar; `avatar.folder` is where it lies, and `wildghand.load_avatar` opens it again.
@@ -236,7 +239,7 @@ def fit(
             only, of another type or out of range.
         BadMethod: a setting is unknown or out of range.
         BadInput: the capture or the video is wrong, or no training frame can be used.
-        MissingDependency: the tracker of hands is not installed.
+        MissingDependency: the tracker of hands, or tensorboard, is not installed.
         DidNotConverge: the fit diverged at once.
         HwpError: the video shows no hand, another fit is writing to `out`, or `out` cannot be
             written.
@@ -245,6 +248,7 @@ def fit(
         source = place(source, "source")
     out = None if out is None else place(out, "out")
     landmarks = None if landmarks is None else place(landmarks, "landmarks")
+    log = None if tensorboard is None else place(tensorboard, "tensorboard")
     of_type(settings, (Mapping, type(None)), "settings", "a table of settings by name")
     of_type(side, (str, type(None)), "side", "a text")
     seconds = None if seconds is None else real_number(seconds, "seconds")
@@ -261,16 +265,19 @@ def fit(
             seed=seed,
             settings=settings or {},
         )
-        return make_avatar(source, out, options, overwrite=overwrite).avatar
+        with logging_fit(log) as watch:
+            return make_avatar(source, out, options, overwrite=overwrite, watch=watch).avatar
     for name, value in (("side", side), ("landmarks", landmarks)):
         if value is not None:
             raise UsageError("is for videos; a capture says it itself", field=name)
-    return fit_capture(
-        source.root if isinstance(source, Capture) else source,
-        out,
-        settings=with_quick(settings or {}, quick=quick),
-        budget=Budget(seconds, steps),
-        seed=seed,
-        all_frames=all_frames is True,
-        overwrite=overwrite,
-    )
+    with logging_fit(log) as watch:
+        return fit_capture(
+            source.root if isinstance(source, Capture) else source,
+            out,
+            settings=with_quick(settings or {}, quick=quick),
+            budget=Budget(seconds, steps),
+            seed=seed,
+            all_frames=all_frames is True,
+            overwrite=overwrite,
+            watch=watch,
+        )

@@ -21,8 +21,9 @@ import torch
 from torch import Tensor, nn
 
 from hwp_bench.base.arrays import read_tensors
-from hwp_bench.base.errors import BadInput, MissingDependency
+from hwp_bench.base.errors import BadInput
 from hwp_bench.base.files import read_json, sha256_json, sha256_of
+from hwp_bench.base.packages import import_extra
 from wildghand.pao.regions import FrameRegions, overlapping
 
 if TYPE_CHECKING:
@@ -105,17 +106,12 @@ def _load(path: Path) -> Any:
     else:
         tensors = {_transformers_name(name): tensor for name, tensor in tensors.items()}
     tensors |= {name: tensors[other] for name in _WAVES for other in _WAVES if other in tensors}
+    problem = "transformers is not installed, which runs Segment Anything"
+    transformers = import_extra("transformers", "sam", problem)
     try:
-        from transformers import SamConfig, SamModel
-    except ImportError as error:
-        raise MissingDependency(
-            "transformers is not installed, which runs Segment Anything",
-            remedy="pip install 'hwp-bench[sam]'",
-        ) from error
-    try:
-        config = SamConfig(**_sizes(tensors, decoder))
+        config = transformers.SamConfig(**_sizes(tensors, decoder))
         with torch.device("meta"):
-            model = SamModel(config)
+            model = transformers.SamModel(config)
         needed = {name: tensors[name].float() for name in model.state_dict()}
         model.load_state_dict(needed, strict=True, assign=True)
     # A name is missing, a tensor has not the axes or the shape.

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 import trimesh
 
-from hwp_bench.base.console import notice
 from hwp_bench.base.drawing import PAPER, fitted, labelled
 from hwp_bench.importers.video.glimpse import Glimpse, PaintedHand
-from wildghand.fitting.fit import Fit
-from wildghand.fitting.glance import Glance, glance
-from wildghand.gaussians.fit_loop import Loss
+from wildghand.fitting.glance import LEAST_PAUSE, Glance, Live
 from wildghand.viewer.server import Address, serving, url
 
 if TYPE_CHECKING:
@@ -47,45 +43,10 @@ def live_sheet(look: Glance, aspect: float) -> np.ndarray:
     return page
 
 
-#: Least seconds between two pictures, and the largest share of the time that goes into them.
-LEAST_PAUSE, SHARE = 1.0, 0.1
 #: Points of the chart; of more, every second one is dropped.
 _POINTS = 400
 # What the metres of a hand are multiplied by: the page's camera stands some units away.
 _ENLARGED = 15.0
-
-
-class Live:
-    """Looks at a fit now and then; see `wildghand.fitting.session.Watch`.
-
-    Args:
-        show: takes what was seen.
-        wanted: whether anybody looks.
-        row: which training frame is looked at.
-        pause: seconds between two looks at least; 0 looks after every step.
-    """
-
-    def __init__(
-        self,
-        show: Callable[[Glance], None],
-        wanted: Callable[[], bool] = lambda: True,
-        row: Callable[[int], int] = lambda count: 0,
-        pause: float = LEAST_PAUSE,
-    ) -> None:
-        self._show, self._wanted, self._row, self._pause = show, wanted, row, pause
-        self._due = 0.0
-
-    def __call__(self, fit: Fit, step: int, loss: Loss) -> None:
-        """Look, where it is time to."""
-        began = time.monotonic()
-        if began < self._due or not self._wanted():
-            return
-        try:
-            self._show(glance(fit, self._row(len(fit.data.frames)), step, float(loss)))
-        except OSError as error:  # the network's: a page that is gone must not end a fit
-            notice(f"The fit cannot be shown ({error}).")
-        now = time.monotonic()
-        self._due = now + max(self._pause, (now - began) * (1.0 / SHARE - 1.0) * bool(self._pause))
 
 
 class LivePage:

@@ -19,7 +19,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from hwp_bench.base.errors import MissingDependency, UsageError
+from hwp_bench.base.errors import UsageError
+from hwp_bench.base.packages import import_extra
 
 if TYPE_CHECKING:
     from viser import ViserServer
@@ -95,13 +96,7 @@ class Address:
 
 def require_viser() -> None:
     """Check that the extra is installed, before work begins."""
-    try:
-        import viser  # noqa: F401
-    except ImportError as error:
-        raise MissingDependency(
-            "viser is not installed, which shows views in a browser",
-            remedy="pip install 'hwp-bench[view]'",
-        ) from error
+    import_extra("viser", "view", "viser is not installed, which shows views in a browser")
 
 
 @contextlib.contextmanager

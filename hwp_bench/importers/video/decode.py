@@ -8,13 +8,13 @@ import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Any, BinaryIO
 
+import av
 import numpy as np
 
 from hwp_bench.base.console import notice
-from hwp_bench.base.errors import BadInput, MissingDependency, UsageError, bounded, check_name
+from hwp_bench.base.errors import BadInput, UsageError, bounded, check_name
 from hwp_bench.base.files import check_is_file
 from hwp_bench.base.images import MAX_PIXELS, read_gray
 from hwp_bench.importers.shared.frames import CropWindows, cut, resample
@@ -165,7 +165,7 @@ def read_times(path: str | os.PathLike[str]) -> np.ndarray | None:
     None where the file does not say it, or has two frames within a millisecond.
     """
     stamps: list[float] = []
-    with _opened(Path(path)) as video, contextlib.suppress(_library().error.FFmpegError):
+    with _opened(Path(path)) as video, contextlib.suppress(av.error.FFmpegError):
         for packet in video.packets():
             clock = packet.time_base
             if not video.has_clock or packet.pts is None or clock is None or clock >= 1:
@@ -347,7 +347,7 @@ class _Video:
         for packet in self._packets_of_file():
             try:
                 frames = packet.decode()
-            except _library().error.FFmpegError:
+            except av.error.FFmpegError:
                 self._damaged += 1
                 continue
             for frame in frames:
@@ -374,7 +374,7 @@ class _Video:
         while True:
             try:
                 packet = next(packets, None)
-            except _library().error.FFmpegError:
+            except av.error.FFmpegError:
                 self._damaged += 1
                 self._cut = True
                 return
@@ -386,7 +386,7 @@ class _Video:
                 if self._own:
                     began = float((packet.stream.start_time or 0) * packet.stream.time_base)
                 else:
-                    began = (self._container.start_time or 0) / _library().time_base
+                    began = (self._container.start_time or 0) / av.time_base
                 self._reached = max(self._reached, end - began)
             if packet.stream.index == own:
                 self._seen += packet.size > 0
@@ -467,7 +467,7 @@ def _expected(container: Any, stream: Any, kind: str) -> tuple[int | None, float
     if stream.duration and stream.time_base and kind != "AVI":
         return None, float(stream.duration * stream.time_base), True
     if container.duration and container.duration > 0:
-        return None, container.duration / _library().time_base, False
+        return None, container.duration / av.time_base, False
     return None, None, True
 
 
@@ -476,7 +476,7 @@ def _choose(container: Any, path: Path) -> Any:
     streams = list(container.streams.video)
     if not streams:
         raise BadInput("contains no video", where=path, remedy="It may hold sound only.")
-    flags = _library().stream.Disposition
+    flags = av.stream.Disposition
     pictures = flags.attached_pic | flags.timed_thumbnails | flags.still_image
     moving = [stream for stream in streams if not stream.disposition & pictures]
     if len(moving) > 1:
@@ -503,7 +503,7 @@ def _choose(container: Any, path: Path) -> Any:
 def _with_frames(container: Any, streams: list[Any]) -> list[Any]:
     """Those of some streams that hold more than a picture or two, as the first packets show."""
     counts = dict.fromkeys((stream.index for stream in streams), 0)
-    with contextlib.suppress(_library().error.FFmpegError):
+    with contextlib.suppress(av.error.FFmpegError):
         for number, packet in enumerate(container.demux(streams)):
             counts[packet.stream.index] += packet.size > 0
             if number > _LOOK or min(counts.values()) >= _MOVING:
@@ -555,12 +555,11 @@ def _opened(path: Path) -> Iterator[_Video]:
     size = path.stat().st_size
     if size == 0:
         raise BadInput("is empty (0 bytes)", where=path)
-    av = _library()
     with contextlib.ExitStack() as stack:
         try:
             stream = stack.enter_context(path.open("rb"))
             kind, packet = _kind(path, stream)
-            container = stack.enter_context(_container(av, stream, kind))
+            container = stack.enter_context(_container(stream, kind))
         except OSError as error:
             if not isinstance(error, av.error.FFmpegError):
                 raise BadInput(f"cannot be read ({error.strerror})", where=path) from error
@@ -570,7 +569,7 @@ def _opened(path: Path) -> Iterator[_Video]:
         yield _Video(path, container, kind, half_packet=size % packet != 0)
 
 
-def _container(av: ModuleType, stream: BinaryIO, kind: str) -> Any:
+def _container(stream: BinaryIO, kind: str) -> Any:
     """Open a container of an open file: no name is taken for an address."""
     reader, _ = CONTAINERS[kind]
     container = av.open(stream, format=reader, buffer_size=_CHUNK)
@@ -589,14 +588,3 @@ def _unreadable(path: Path, kind: str) -> BadInput:
     if kind == "MP4 or MOV":
         remedy = f"A file that was cut off has lost its index, which stands at its end. {remedy}"
     return BadInput(f"is damaged or no video ({kind})", where=path, remedy=remedy)
-
-
-def _library() -> ModuleType:
-    try:
-        import av
-    except ImportError as error:
-        raise MissingDependency(
-            "nothing here can decode videos", remedy="Install PyAV: pip install av"
-        ) from error
-    library: ModuleType = av
-    return library

@@ -5,13 +5,17 @@ Settings that name files. Oracle: constructed methods and files.
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from small_methods import write_manifest
+from small_captures import CaptureMaker
+from small_methods import SCRIPT, write_manifest
 
+import hwp_bench
 from hwp_bench.base.errors import BadMethod, HwpError, UsageError
+from hwp_bench.cli.main import main
 from hwp_bench.evaluation.capture_evaluation import EvaluationSettings
 from hwp_bench.evaluation.evaluate import with_setting_files
 from hwp_bench.methods.contract import RunSettings
@@ -23,6 +27,7 @@ from hwp_bench.methods.manifest import (
     find_setting_files,
     read_manifest,
     shipped_methods,
+    ships,
 )
 from hwp_bench.methods.settings import check_source, source_path
 
@@ -164,6 +169,48 @@ def test_shipped_methods_are_found_in_a_wheel(
     monkeypatch.chdir(tmp_path)
     assert find_method("plain") == find_method("baselines/plain") == inside
     assert [manifest.name for manifest in shipped_methods()] == ["mine"]
+
+
+def install(site: Path, entries: dict[str, str]) -> None:
+    """Install a distribution whose entry points name methods, as pip leaves it."""
+    facts = site / "someones-1.0.dist-info"
+    facts.mkdir(parents=True)
+    (facts / "METADATA").write_text("Metadata-Version: 2.1\nName: someones\nVersion: 1.0\n")
+    lines = [f"{name} = {value}" for name, value in entries.items()]
+    (facts / "entry_points.txt").write_text("\n".join(["[hwp_bench.methods]", *lines, ""]))
+
+
+def test_methods_of_installed_packages_are_found_without_an_import(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    make_capture: CaptureMaker,
+) -> None:
+    site = tmp_path / "site"
+    entries = {"someones": "someones_hands", "inner": "someones_hands.inner", "wrong": "nowhere"}
+    install(site, {**entries, "plain": "someones_hands", "empty": "someones_hands.empty"})
+    package = write_manifest(site / "someones_hands", "someones", SCRIPT)
+    (package / "__init__.py").write_text("raise AssertionError('it was imported')\n")
+    script = "import json, sys; json.load(open(sys.argv[1] + '/request.json')); sys.exit('no luck')"
+    (package / "run.py").write_text(script)
+    write_manifest(package / "inner", "inner", SCRIPT)
+    monkeypatch.syspath_prepend(site)
+    monkeypatch.chdir(tmp_path)
+    assert find_method("someones") == package
+    assert find_method("inner") == package / "inner"
+    assert find_method("plain") != package  # what ships comes first
+    assert not ships(package)
+    with pytest.raises(BadMethod, match=r"it has no method\.toml"):
+        find_method("wrong")
+    assert main(["list", "methods", "--json"]) == 0
+    out, err = capsys.readouterr()
+    names = [row["method"] for row in json.loads(out)["methods"]]
+    assert names == [*(one.name for one in shipped_methods()), "someones", "inner"]
+    assert "left out: " in err
+    assert "empty: is not a method directory" in err
+    # It runs by its name: the script's own words come back.
+    results = hwp_bench.evaluate("someones", make_capture(frames=20), tmp_path / "out")
+    assert "no luck" in str(results.captures[0].failure)
 
 
 @pytest.mark.parametrize("name", ["../plain", "baselines/../wildghand", ".", ""])

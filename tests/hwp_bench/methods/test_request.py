@@ -19,6 +19,7 @@ from hwp_bench.capture import Capture
 from hwp_bench.capture.schema import TRUE_TEMPLATE, write_subject_mesh
 from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.hands import load_template
+from hwp_bench.hands.skinning import pose_parameters
 from hwp_bench.methods.contract import Budget, RunSettings
 from hwp_bench.methods.request import (
     ORACLE_INPUTS,
@@ -219,3 +220,26 @@ def test_a_capture_says_what_it_knows(make_capture: CaptureMaker, capture: Captu
     with pytest.raises(UsageError, match="'light' is not one of pixels, masks"):
         choose_training_inputs(capture, SPLIT, "true:light")
     assert frame_choice(reversed(ORACLE_INPUTS)) == "true:" + ",".join(ORACLE_INPUTS)
+
+
+def test_vertices_and_joints_are_those_of_the_posed_model(
+    make_capture: CaptureMaker, tmp_path: Path
+) -> None:
+    # Oracle: the model's own forward pass over the whole clip, in float64 as well.
+    capture = make_capture(frames=20, hands="both")
+    root = write_request(tmp_path / "request", capture, contiguous_split("tiny", 20), RUN)
+    training = open_request(root)
+    posed = {s: pose_parameters(capture.template(s), capture.hands[s]) for s in capture.info.sides}
+    for frame in (3, 19):
+        vertices, joints = training.vertices(frame), training.joints(frame)
+        given = training.vertices(training.hand_poses(frame))
+        assert set(vertices) == set(joints) == set(given) == {"right", "left"}
+        for side in capture.info.sides:
+            assert vertices[side].shape == capture.template(side).vertices.shape
+            np.testing.assert_allclose(vertices[side], posed[side].vertices[frame], atol=1e-12)
+            np.testing.assert_allclose(joints[side], posed[side].joints[frame], atol=1e-12)
+            np.testing.assert_array_equal(given[side], vertices[side])
+    left = replace(training.hands["left"], valid=np.arange(20) != 5)
+    other = training.with_hands({**training.hands, "left": left})
+    assert set(other.vertices(5)) == {"right"}
+    assert set(other.vertices(6)) == {"right", "left"}

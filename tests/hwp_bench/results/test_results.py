@@ -6,6 +6,7 @@ Runs without walls are named on the console and below tables. Oracle: the made r
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,11 +14,11 @@ import pytest
 from small_captures import results_example
 
 from hwp_bench.analysis.cost import machine_notes
-from hwp_bench.base.errors import BadInput, BadResult
+from hwp_bench.base.errors import BadInput, BadResult, MissingDependency
 from hwp_bench.base.tables import to_markdown
 from hwp_bench.evaluation.sentences import outcome_lines
 from hwp_bench.report.tables import all_tables
-from hwp_bench.results import Results, read_results, write_results
+from hwp_bench.results import FreeViewResult, Results, read_results, write_results
 from hwp_bench.results.schema import add_isolation_note, environment, isolation_note, isolation_text
 
 
@@ -116,3 +117,26 @@ def test_every_table_names_methods_that_ran_without_walls(isolation: str) -> Non
         assert not any(
             "walls" in text for t in all_tables([_made(kind)]).values() for text in t.notes
         )
+
+
+def test_results_become_tables_of_pandas(make_results) -> None:
+    results = make_results()
+    (capture,) = results.captures
+    clip = FreeViewResult("d", capture.frames[:1], "p")
+    results = replace(results, captures=[replace(capture, free_view=clip)])
+    frames = results.to_frame()
+    assert frames.columns.tolist() == [
+        *("method", "suite", "seed", "capture", "frame", "psnr", "ssim", "failure")
+    ]
+    assert frames["frame"].tolist() == [18, 19]
+    assert frames.groupby("capture")["psnr"].mean().to_dict() == {"capture2": 20.5}
+    assert results.to_frame(free_view=True)["psnr"].tolist() == [20.0]
+    assert make_results().to_frame(free_view=True).empty
+
+
+def test_without_pandas_a_table_says_what_to_install(
+    make_results, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(MissingDependency, match=r"pip install 'hwp-bench\[pandas\]'"):
+        make_results().to_frame()

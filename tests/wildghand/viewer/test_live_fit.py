@@ -17,12 +17,11 @@ from hwp_bench.methods.contract import Budget, TrainingCapture
 from wildghand.fitting import fit_capture
 from wildghand.fitting.components import make_fit
 from wildghand.fitting.fit import Fit
-from wildghand.fitting.glance import Glance, glance
+from wildghand.fitting.glance import Glance, Live, glance
 from wildghand.fitting.session import Watch
 from wildghand.gaussians.fit_loop import Loss
 from wildghand.model.settings import read_settings
 from wildghand.plain.loop import Watchers, run_fit
-from wildghand.viewer.live import Live
 
 QUICK: dict[str, Any] = {**UNJUDGED, "gaussians": 400}
 TrainingMaker = Callable[..., TrainingCapture]
@@ -96,7 +95,7 @@ def test_a_look_waits_for_its_time_and_for_somebody_who_looks(
 ) -> None:
     fit = make_fit(make_training(), read_settings(QUICK), 0, torch.device("cpu"))
     now, seen, looked = [100.0], [], [False]
-    monkeypatch.setattr("wildghand.viewer.live.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("wildghand.fitting.glance.time.monotonic", lambda: now[0])
 
     def show(look: Glance) -> None:
         seen.append(look.step)

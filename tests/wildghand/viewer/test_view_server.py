@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import atexit
-import builtins
 import json
 import os
 import signal
@@ -128,15 +127,8 @@ def test_without_the_extra_a_command_says_how_to_get_it(
     capsys: pytest.CaptureFixture[str],
     tmp_path: Path,
 ) -> None:
-    found = builtins.__import__
-
-    def missing(name: str, *args: Any, **options: Any) -> Any:
-        if name.partition(".")[0] == "viser":
-            raise ImportError(name)
-        return found(name, *args, **options)
-
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(builtins, "__import__", missing)
+    monkeypatch.setitem(sys.modules, "viser", None)
     assert main(words) == 1
     said = capsys.readouterr()
     assert said.out == ""
