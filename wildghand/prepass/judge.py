@@ -53,8 +53,6 @@ SAMPLE_COUNT = 120_000
 #: Pixels of all frames together beyond which they are judged at a lower resolution, so that the
 #: pre-pass stays at some seconds.
 PIXEL_BUDGET = 30_000_000
-#: Frames are judged at the lowest whole share of their resolution at which they have this edge, px.
-LEAST_EDGE = 112
 #: Fewer usable frames than this cannot be compared: all are judged clean. Nor do fewer validation
 #: frames raise the tolerance.
 LEAST_FRAMES = 4
@@ -262,15 +260,15 @@ def judge_frames(
 ) -> FrameAssessment:
     """Judge frames that are already in memory; deterministic.
 
-    Large frames, and frames of more than `PIXEL_BUDGET` pixels, are judged at a lower resolution;
-    weights and lengths are brought back to the full one. Fewer usable frames than `LEAST_FRAMES` cannot be compared:
+    Beyond `PIXEL_BUDGET` pixels the frames are judged at a lower resolution; weights and lengths
+    are brought back to the full one. Fewer usable frames than `LEAST_FRAMES` cannot be compared:
     all of them are judged clean.
     """
     settings = settings or PrepassSettings()
     excess_pixels = given.masks.size / PIXEL_BUDGET
-    factor = max(1, math.ceil(math.sqrt(excess_pixels)), min(given.size) // LEAST_EDGE)
-    if factor == 1:
+    if excess_pixels <= 1.0:
         return _judge(given, settings, known_clean)
+    factor = math.ceil(math.sqrt(excess_pixels))
     known = None if known_clean is None else known_clean.shrunk(factor)
     return enlarged(_judge(given.shrunk(factor), settings, known), factor, given.size)
 
