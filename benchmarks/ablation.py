@@ -42,6 +42,7 @@ from hwp_bench.evaluation.ablate.effects import (
     score_effects,
 )
 from hwp_bench.evaluation.ablate.runs import AblationRuns, Design, make_design, result_folder
+from hwp_bench.leaderboard.pages import with_digest
 from hwp_bench.methods.manifest import find_method, read_manifest
 from hwp_bench.report.figures import write_cost
 from hwp_bench.report.sources import find_captures, read_sources
@@ -292,7 +293,7 @@ def write_page(folder: Path, page: Path, pictures: Path, study: Study) -> None:
         bases=[item for item in shown if item["base"]],
         missing=[(part.title, part.missing, bool(part.ablation)) for part in parts if part.missing],
     )
-    atomic_write(page, text)
+    atomic_write(page, with_digest(text))
     notice(f"page: {page}")
 
 

@@ -133,9 +133,10 @@ def print_table(method: str, arguments: argparse.Namespace) -> None:
     trials = listed["trials"] if arguments.set is None else arguments.set
     items = [item for item in suite(arguments.suite) if item.scene.id in names]
     captures = ensure_suite(items, free_view=False)
-    budget = Budget(steps=arguments.steps)
+    budget, limit = Budget(steps=arguments.steps), f"{arguments.steps} steps"
     if arguments.seconds is not None:
         budget = make_budget(arguments.seconds, None)
+        limit = f"{arguments.seconds:g} processor seconds"
     preset = manifest.presets[arguments.preset]
     print(f"\n| {manifest.name} |", " | ".join(item.scene.id for item in items), "| mean |")
     print("| --- |" + " ---: |" * (len(items) + 1), flush=True)
@@ -147,25 +148,13 @@ def print_table(method: str, arguments: argparse.Namespace) -> None:
             if arguments.test:
                 scores.append(score_fit(*given, test=True))
                 continue
-            fit = {
-                "method": manifest.name,
-                "digest": manifest.digest,
-                "trial": text,
-                "capture": open_capture(path).info.id,
-                "data": open_capture(path).digest,
-                "preset": arguments.preset,
-                "limit": _limit(arguments),
-                "seed": arguments.seed,
-            }
+            capture = open_capture(path)
+            fit = {"method": manifest.name, "digest": manifest.digest, "trial": text}
+            fit |= {"capture": capture.info.id, "data": capture.digest, "limit": limit}
+            fit |= {"preset": arguments.preset, "seed": arguments.seed}
             scores.append(kept_score(arguments.log, fit, partial(score_fit, *given)))
         cells = " | ".join(f"{score:.2f}" for score in (*scores, float(np.mean(scores))))
         print(f"| {text.replace(',', ' ') or 'preset'} | {cells} |", flush=True)
-
-
-def _limit(arguments: argparse.Namespace) -> str:
-    if arguments.seconds is not None:
-        return f"{arguments.seconds:g} processor seconds"
-    return f"{arguments.steps} steps"
 
 
 def kept_score(log: Path, fit: Mapping[str, Any], make: Callable[[], float]) -> float:

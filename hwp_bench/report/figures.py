@@ -307,44 +307,33 @@ def _draw_bar(axes: Axes, estimate: Estimate, color: str, middle: float, high: f
 
 def draw_leads(title: str, leads: Sequence[tuple[str, Estimate]], metric: str) -> Figure:
     """Draw by how much a method is ahead of each other one: a bar, its 95 % interval, a number."""
-    facts = metric_facts(metric)
-    ends = [end for _, one in leads for end in (one.value, one.low, one.high) if end is not None]
-    low, high = min([*ends, 0.0]), max([*ends, 0.0])
-    margin, left, height = 0.03 * (high - low or 1.0), 145.0, 19.0 * len(leads)
-    with figure_style():
-        figure = new_figure(height + 46)
-        axes = add_axes(figure, left, 22, WIDTH - left - 50, height)
-        axes.set(xlim=(low - margin, high + margin), ylim=(len(leads), 0))
-        axes.axvline(0.0, color=PALETTE["ink"], linewidth=1)
-        _scale_across(axes)
-        for place, (label, estimate) in enumerate(leads):
-            middle = place + 0.5
-            surely = False
-            if estimate.low is not None and estimate.high is not None:
-                surely = not estimate.low <= 0.0 <= estimate.high
-                reach = estimate.low, estimate.high
-                axes.hlines(middle, *reach, color=PALETTE["ink"], linewidth=1.4, zorder=3)
-            color = PALETTE["s0" if estimate.value > 0 else "s1"]
-            axes.barh(middle, estimate.value, height=0.6, color=color, alpha=1.0 if surely else 0.4)
-            number = f"{estimate.value:+.{facts.digits}f}"
-            for text, at, side in ((label, 0.0, "right"), (number, 1.0, "left")):
-                axes.annotate(
-                    text, (at, middle), (-6 if at == 0 else 6, 0), ha=side, va="center",
-                    xycoords=axes.get_yaxis_transform(), textcoords="offset points",
-                )  # fmt: skip
-        unit = f" [{facts.unit}]" if facts.unit else ""
-        heading(axes, f"{title} ahead in {facts.label}{unit}, with 95 % intervals")
-    return figure
-
-
-def _scale_across(axes: Axes) -> None:
-    """Give axes round numbers below, and lines through them."""
     from matplotlib.ticker import MaxNLocator
 
-    axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
-    axes.tick_params(axis="x", labelbottom=True, pad=4)
-    axes.grid(axis="x", color=PALETTE["line"], linewidth=0.7)
-    axes.set_axisbelow(True)
+    facts, height = metric_facts(metric), 19.0 * len(leads)
+    with figure_style():
+        figure = new_figure(height + 46)
+        axes = add_axes(figure, 145, 22, WIDTH - 195, height)
+        axes.set_ylim(len(leads), 0)
+        axes.margins(x=0.03)
+        axes.axvline(0.0, color=PALETTE["ink"], linewidth=1)
+        for place, (label, one) in enumerate(leads):
+            middle, surely = place + 0.5, False
+            if one.low is not None and one.high is not None:
+                surely = not one.low <= 0.0 <= one.high
+                axes.hlines(middle, one.low, one.high, color=PALETTE["ink"], zorder=3)
+            color, alpha = PALETTE["s0" if one.value > 0 else "s1"], 1.0 if surely else 0.4
+            axes.barh(middle, one.value, height=0.6, color=color, alpha=alpha)
+            number = f"{one.value:+.{facts.digits}f}"
+            for text, at, side in ((label, -0.02, "right"), (number, 1.02, "left")):
+                line = axes.get_yaxis_transform()
+                axes.text(at, middle, text, ha=side, va="center", transform=line)
+        axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
+        axes.tick_params(axis="x", labelbottom=True, pad=4)
+        axes.grid(axis="x", color=PALETTE["line"], linewidth=0.7)
+        axes.set_axisbelow(True)
+        unit = f" [{facts.unit}]" if facts.unit else ""
+        heading(axes, f"{title} ahead in {facts.label}{unit}")
+    return figure
 
 
 def write_cost(folder: Path, analysis: CostAnalysis) -> list[Path]:

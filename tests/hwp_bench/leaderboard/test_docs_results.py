@@ -10,9 +10,17 @@ from pathlib import Path
 import pytest
 from made_entries import complete_results
 
+from hwp_bench.analysis.bootstrap import Estimate
 from hwp_bench.base.errors import UsageError
 from hwp_bench.cli.main import main
-from hwp_bench.leaderboard.pages import PICTURES, find_faults, verdict_of, write_pages
+from hwp_bench.leaderboard.pages import (
+    PICTURES,
+    Sources,
+    find_faults,
+    verdict_of,
+    with_digest,
+    write_pages,
+)
 from hwp_bench.leaderboard.submit import PLACE, add_entries
 from hwp_bench.results import write_results
 
@@ -188,6 +196,35 @@ def test_a_decibel_outside_of_blocks_needs_a_source(
     ]
 
 
+def test_a_page_that_a_program_wrote_is_as_it_was_written(checkout: Path) -> None:
+    page, typed = checkout / "docs" / "page.md", checkout / "docs" / "results.toml"
+    typed.write_text(TYPED.replace("[def", '"page.md" = "benchmarks/some.py"\n[def'))
+    page.write_text(with_digest("It brings 2.5 dB.\n"))
+    try:
+        assert with_digest(page.read_text()) == page.read_text()
+        assert find_faults(checkout) == []
+        page.write_text(page.read_text().replace("2.5", "2.6"))
+        fault = "docs/page.md: is not as benchmarks/some.py wrote it"
+        assert find_faults(checkout) == [fault]
+        page.write_text("It brings 2.5 dB.\n")
+        assert find_faults(checkout) == [fault]
+    finally:
+        page.unlink()
+        typed.write_text(TYPED)
+
+
+def test_suites_that_nothing_was_designed_on_come_first(tmp_path: Path) -> None:
+    names = ("mini", "smoke", "real-1", "wild-test")
+    made = [complete_results("mine", 20.0, suite_name=name) for name in names]
+    add_entries(tmp_path / PLACE, made)
+    assert [one.suite for one in Sources(tmp_path).fields] == [
+        "wild-test",
+        "real-1",
+        "smoke",
+        "mini",
+    ]
+
+
 def test_a_wrong_place_and_a_wrong_block_are_refused(tmp_path: Path, checkout: Path) -> None:
     with pytest.raises(UsageError, match="not a checkout"):
         write_pages(tmp_path)
@@ -199,12 +236,11 @@ def test_a_wrong_place_and_a_wrong_block_are_refused(tmp_path: Path, checkout: P
 
 
 def test_a_verdict_follows_the_interval() -> None:
-    from hwp_bench.analysis.bootstrap import Estimate
 
     told = {(0.1, 2.0): "ahead", (-2.0, -0.1): "behind", (-0.1, 0.1): "not told apart"}
     for (low, high), text in told.items():
         assert verdict_of(Estimate((low + high) / 2, low, high, None, None, None, 8)) == text
-    assert verdict_of(None) == "not known"
+    assert verdict_of(None) is None
 
 
 def test_a_folder_of_methods_and_seeds_is_added_in_one_call(
