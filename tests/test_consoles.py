@@ -42,13 +42,12 @@ COMMANDS = (
     "table --published",
     "table --published --paper 5",
     "compare A B",
-    "cost A B -o COST",
+    "curves A B -o COST",
     "data check CAPTURE",
-    "data audit CAPTURE",
     "evaluate ENTRY --capture CAPTURE -o RUN",
     "verify RUN --capture CAPTURE",
     "list scenes",
-    "sim plan capture4 --no-probe",
+    "dev plan capture4 --no-probe",
     "wildghand info --network compact",
 )
 
@@ -104,7 +103,7 @@ def test_tables_are_printed_in_every_encoding(
     numbers = re.findall(r"\d+\.\d+", expected)
     widest = max(map(len, expected.splitlines()))
     for code, (ended, out, _) in said.items():
-        text = out.decode("utf-8" if command.startswith("sim plan") else code)
+        text = out.decode("utf-8" if command.startswith("dev plan") else code)
         assert ended == status
         if "info" not in command and "evaluate" not in command:
             assert re.findall(r"\d+\.\d+", text) == numbers

@@ -308,7 +308,7 @@ def _evaluation_settings(args: argparse.Namespace) -> EvaluationSettings:
 _ABLATE = """examples:
   hwp-bench ablate --suite mini                          # DPD x PAO x pre-pass, three seeds
   hwp-bench ablate --only dpd pao                        # DPD x PAO
-  hwp-bench ablate --without dpd                         # the full method, and without DPD
+  hwp-bench ablate --no-dpd --no-pao                     # each out of the full method, and both
   hwp-bench ablate --without dpd pao heads               # each out of the full method, all out
   hwp-bench ablate --with binary-mask                    # a binary mask in place of PAO's weights
   hwp-bench ablate --only dpd pao heads                  # 2 x 2 x 2
@@ -336,6 +336,9 @@ def _add_ablate(parser: argparse.ArgumentParser) -> None:
     add("method", metavar="METHOD", nargs="?", default="wildghand", help=text)
     text = "leave out components of method.toml, such as dpd, pao and heads of wildghand"
     add("--without", **SEVERAL, metavar="COMPONENT", help=text)
+    for name in ("dpd", "pao"):
+        text = f"the same as --without {name}"
+        add(f"--no-{name}", dest="without", action="append_const", const=name, help=text)
     text = "use alternatives of method.toml, such as binary-mask of wildghand"
     add("--with", dest="alternatives", **SEVERAL, metavar="NAME", help=text)
     add("--only", **SEVERAL, metavar="COMPONENT", help="cross these components")

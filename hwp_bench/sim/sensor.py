@@ -17,9 +17,9 @@ from typing import Annotated, Any
 import numpy as np
 from msgspec import Meta
 
+from hwp_bench.base import images
 from hwp_bench.base.colors import LUMA
-from hwp_bench.base.errors import HwpError
-from hwp_bench.base.images import yuv_planes
+from hwp_bench.base.errors import HwpError, MissingDependency
 from hwp_bench.base.records import number
 from hwp_bench.sim.geometry.noise import generator
 
@@ -118,22 +118,27 @@ def sharpened(image: np.ndarray, strength: float) -> np.ndarray:
     return np.clip(np.round(raised), 0, 255).astype(np.uint8)
 
 
-#: Encoder in FFmpeg's naming, its preset, and the frames from one that stands alone to the next.
-ENCODER, PRESET, KEYFRAME_EVERY = "libx264", "veryfast", 30
+#: Preset of the encoder, and the frames from one that stands alone to the next.
+PRESET, KEYFRAME_EVERY = "veryfast", 30
 #: Frames of which the rate control may move bits from one to another.
 BUFFER_FRAMES = 30
 
 
-def check_encoder(where: str) -> None:
-    """Refuse a scene whose video cannot be encoded here."""
-    _library(where)
+def check_encoder(where: str) -> ModuleType:
+    """Refuse a scene whose video cannot be encoded here; returns PyAV."""
+    try:
+        return images.check_encoder()
+    except MissingDependency as error:
+        problem = "its sensor stores H.264, and nothing here can encode that"
+        remedy = "Install PyAV: pip install av; or leave the field out."
+        raise HwpError(problem, where=where, field="sensor.h264", remedy=remedy) from error
 
 
 def through_h264(
     frames: Iterable[np.ndarray], bits_per_pixel: float, fps: float, where: str
 ) -> Iterator[np.ndarray]:
     """Encode a clip of (H, W, 3) uint8 sRGB frames and decode it again."""
-    av = _library(where)
+    av = check_encoder(where)
     try:
         yield from _coded(av, iter(frames), bits_per_pixel, fps)
     except av.error.FFmpegError as error:
@@ -156,7 +161,7 @@ def _coded(
                 yield _to_rgb(frame.to_ndarray(format="yuv420p"), height, width)
 
     for index, image in enumerate(itertools.chain([first], frames)):
-        frame = av.VideoFrame.from_ndarray(yuv_planes(image), format="yuv420p")
+        frame = av.VideoFrame.from_ndarray(images.yuv_planes(image), format="yuv420p")
         frame.pts = index
         yield from decoded(encoder.encode(frame))
     yield from decoded(encoder.encode(None))
@@ -167,7 +172,7 @@ def _encoder(av: ModuleType, size: tuple[int, int], bits_per_pixel: float, fps: 
     height, width = (edge + edge % 2 for edge in size)
     rate = Fraction(fps).limit_denominator(1000)
     bits = max(int(bits_per_pixel * height * width * float(rate)), 1000)
-    encoder = av.CodecContext.create(ENCODER, "w")
+    encoder = av.CodecContext.create(images.ENCODER, "w")
     most = (
         f"vbv-maxrate={bits // 1000 + 1}:vbv-bufsize={int(bits / rate * BUFFER_FRAMES) // 1000 + 1}"
     )
@@ -193,20 +198,3 @@ def _to_rgb(planes: np.ndarray, height: int, width: int) -> np.ndarray:
 
     image = cv2.cvtColor(planes, cv2.COLOR_YUV2RGB_I420)
     return np.ascontiguousarray(image[:height, :width], dtype=np.uint8)
-
-
-def _library(where: str) -> ModuleType:
-    """PyAV, if it has the encoder."""
-    try:
-        import av
-
-        av.codec.Codec(ENCODER, "w")
-    except (ImportError, ValueError) as error:
-        raise HwpError(
-            "its sensor stores H.264, and nothing here can encode that",
-            where=where,
-            field="sensor.h264",
-            remedy="Install PyAV: pip install av; or leave the field out.",
-        ) from error
-    library: ModuleType = av
-    return library

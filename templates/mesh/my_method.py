@@ -1,9 +1,7 @@
 """The posed mesh of the hand, in the mean colours that the training frames show."""
 
 import numpy as np
-import torch
 
-from hwp_bench.hands import pose_hand
 from hwp_bench.hands.raster import draw_faces
 
 
@@ -37,27 +35,19 @@ class Surface:
     """The meshes of all hands of a capture."""
 
     def __init__(self, training):
-        """Load the template of each hand; their vertices are numbered through."""
-        self.templates = {side: training.template(side) for side in training.sides}
-        first, faces = 0, []
-        for template in self.templates.values():
-            faces.append(template.faces + first)
-            first += len(template.vertices)
-        self.faces, self.count = np.concatenate(faces), first
-
-    def vertices(self, hands):
-        """Pose the hands: (V, 3) vertices in the world, m."""
-        posed = []
-        for side, template in self.templates.items():
-            hand = hands[side]
-            pose, transl = (torch.tensor(a)[None].double() for a in (hand.pose, hand.transl))
-            betas = torch.tensor(hand.betas).double()
-            posed.append(pose_hand(template.to_torch(torch.float64), pose, betas, transl))
-        return np.concatenate([hand.vertices[0].numpy() for hand in posed])
+        """Number the vertices of all hands through."""
+        self.training, self.count, faces = training, 0, []
+        for side in training.sides:
+            template = training.template(side)
+            faces.append(template.faces + self.count)
+            self.count += len(template.vertices)
+        self.faces = np.concatenate(faces)
 
     def draw(self, hands, camera):
         """Return the pixels that the hands cover (H, W), their vertices (P, 3) and weights."""
-        points = self.vertices(hands) @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+        posed = self.training.vertices(hands)
+        points = np.concatenate([posed[side] for side in self.training.sides])
+        points = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
         pixels = (points @ camera.K.T)[:, :2] / points[:, 2:]
         face, mix = draw_faces(pixels, points[:, 2], self.faces, (camera.height, camera.width))
         covered = face >= 0

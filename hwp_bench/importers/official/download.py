@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 import re
 from collections.abc import Callable, Sequence
@@ -10,8 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hwp_bench.base.errors import BadInput, HwpError, MissingDependency, UsageError
+from hwp_bench.base.errors import BadInput, HwpError, UsageError
 from hwp_bench.base.files import cache_root, inside, read_json, sha256_file, write_json
+from hwp_bench.base.packages import import_extra
 
 #: The release, a data set on the hub.
 REPOSITORY = "XuanHuang0/WildGHand"
@@ -55,13 +55,8 @@ class HuggingFaceHub:
     """The hub through `huggingface_hub`."""
 
     def __init__(self) -> None:
-        try:
-            self._hub: Any = importlib.import_module("huggingface_hub")
-        except ImportError as error:
-            raise MissingDependency(
-                "huggingface_hub is not installed",
-                remedy="pip install 'hwp-bench[hub]', or download the release by hand.",
-            ) from error
+        problem = "huggingface_hub is not installed; the release can be downloaded by hand, too"
+        self._hub = import_extra("huggingface_hub", "hub", problem)
 
     def files(self, revision: str | None) -> tuple[str, list[RemoteFile]]:
         """Return the commit that a revision names, and its files."""

@@ -70,7 +70,7 @@ def test_what_new_writes_is_sound_and_is_scored(
     assert said.err == "next: hwp-bench check-method 3d-hand\n"
     for file in said.out.split():
         assert Path(file).is_file()
-    status, report = check(Path("3d-hand"), both, capsys, "--set=steps=5")
+    status, report = check(Path("3d-hand"), both, capsys, "--budget=1000")
     assert report["findings"] == []
     assert status == 0
     asked = EvaluationSettings(run=RunSettings({"steps": 5}))

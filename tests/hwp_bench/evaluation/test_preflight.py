@@ -68,7 +68,7 @@ WRONG = (
 SWITCH = "[switches.a]\nsettings_off = {level = 0.1}\n"
 
 
-@pytest.mark.parametrize("command", ["evaluate", "ablate", "budget"])
+@pytest.mark.parametrize("command", ["evaluate", "ablate", "error-budget"])
 def test_a_wrong_call_renders_nothing(command: str, tmp_path: Path, capsys) -> None:
     _method(tmp_path / "mine", more=SWITCH)
     (tmp_path / "file").write_text("mine")
@@ -94,7 +94,7 @@ def test_a_method_that_cannot_start_renders_nothing(
     assert problem in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("command", ["evaluate", "ablate", "budget"])
+@pytest.mark.parametrize("command", ["evaluate", "ablate", "error-budget"])
 def test_a_method_that_cannot_be_made_is_said_once_before_the_first_capture(
     command: str, make_capture: CaptureMaker, tmp_path: Path, capsys
 ) -> None:

@@ -126,10 +126,11 @@ def test_a_failing_variant_is_named_and_penalised(captures, tmp_path: Path, caps
 def test_wrong_switches_are_refused_before_anything_runs(tmp_path: Path, capsys) -> None:
     method = write_toy_method(tmp_path / "toy")
     base = ["ablate", str(method), "-o", str(tmp_path / "out")]
-    assert main([*base, "--without", "dpd"]) == 2
-    assert "toy has no switch 'dpd'. It declares: tone, edge, hard-mask" in (
-        capsys.readouterr().err
-    )
+    for words in (["--without", "dpd"], ["--no-dpd"], ["--no-dpd", "--no-pao"]):
+        assert main([*base, *words]) == 2
+        assert "toy has no switch 'dpd'. It declares: tone, edge, hard-mask" in (
+            capsys.readouterr().err
+        )
     assert main([*base, "--seeds", "0"]) == 2
     assert main([*base, "--only", "tone", "--without", "edge"]) == 2
     assert not (tmp_path / "out").exists()

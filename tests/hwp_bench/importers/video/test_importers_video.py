@@ -276,8 +276,8 @@ def test_bad_input_is_one_clear_error_and_leaves_nothing(
         (["--id", "a\x1bb"], "id: 'a\\x1bb' is not a capture id"),
         (["--perturbations", "\x1b"], "there is no perturbation"),
         (["--sheet", "sheet.xyz"], "--sheet: must end in one of .png"),
-        (["--sheet", "."], "OUT: lies in the output --sheet"),
-        (["--sheet", "out/sheet.png"], "--sheet: lies in the output OUT"),
+        (["--sheet", "."], "--out: lies in the output --sheet"),
+        (["--sheet", "out/sheet.png"], "--sheet: lies in the output --out"),
         (["--sheet", "hand.npz/sheet.png"], "--sheet: lies in the input --landmarks"),
     ],
 )
