@@ -92,7 +92,7 @@ def test_tables_of_strange_results(tmp_path: Path, other: Path, capsys, value) -
 @given(edited(SOUND))
 def test_costs_and_reports_of_strange_results(tmp_path: Path, other: Path, capsys, value) -> None:
     place = str(written(tmp_path / "strange", value))
-    told(capsys, "cost", place, str(other), "--json", "-o", str(tmp_path / "cost"))
+    told(capsys, "curves", place, str(other), "--json", "-o", str(tmp_path / "cost"))
     told(capsys, "report", place, str(other), "-o", str(tmp_path / "report"))
 
 

@@ -140,7 +140,7 @@ def test_a_slow_compiler_is_not_in_the_seconds_of_an_evaluation(
         return method
 
     monkeypatch.setattr(worker, "time", jump)
-    worker.run(make_training(), slow, tmp_path / "out")
+    worker.run(make_training(), slow, tmp_path / "out", worker.render_checked)
     facts = read_facts(tmp_path / "out" / RUN)
     assert facts.steps == 2
     assert facts.fit_seconds is not None
