@@ -399,9 +399,9 @@ class WildGHandModel(nn.Module):
         behind = None
         if self.visibility is not None:
             bias = self.network.activation.log_scale_bias
-            facing = None if viewmats is None else facing_of(anchors, viewmats)
-            behind = None if facing is None else self.visibility.behind(side, facing)
-            settled = self.visibility.settle(side, prediction.raw, rig.spacing, bias, facing)
+            if viewmats is not None:
+                behind = self.visibility.behind(side, facing_of(anchors, viewmats))
+            settled = self.visibility.settle(side, prediction.raw, rig.spacing, bias, behind)
             prediction = replace(prediction, raw=settled)
         if self.color_changes is not None:
             colored = self.color_changes.color(side, prediction.raw, behind)

@@ -154,7 +154,7 @@ def hand_content(
     rig, network, wall = model.rigs[side], model.network, model.wall(side)
     features, behind = network.features(side), _unseen(avatar, side)
     betas = torch.as_tensor(avatar.betas[side], dtype=torch.float32).to(features.betas)
-    steps, said = _sample(avatar, side, poses, features, tabled=tabled)
+    steps, said = _sample(avatar, side, poses, features, behind, tabled=tabled)
     shape = betas + features.betas if settings.heads else betas
     template = rig.template
     rest = template.vertices + template.shape_basis @ shape
@@ -233,6 +233,7 @@ def _sample(
     side: str,
     poses: np.ndarray,
     features: HandFeatures,
+    behind: torch.Tensor,
     *,
     tabled: bool,
 ) -> tuple[np.ndarray | None, np.ndarray]:
@@ -242,7 +243,7 @@ def _sample(
     """
     model, rig = avatar.model, avatar.model.rigs[side]
     betas = torch.as_tensor(avatar.betas[side], dtype=torch.float32).to(features.betas)
-    steps, said, behind = [], [], _unseen(avatar, side)
+    steps, said = [], []
     for part in torch.as_tensor(poses, dtype=torch.float32).to(betas).split(_CHUNK):
         anchors = rig.pose(part, betas, part.new_zeros(len(part), 3))
         made = model.predict(side, anchors, part, features)

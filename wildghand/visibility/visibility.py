@@ -69,19 +69,16 @@ class Visibility(Found):
         raw: RawAttributes,
         spacing: float,
         log_scale_bias: float,
-        facing: Tensor | None = None,
+        behind: Tensor | None = None,
     ) -> RawAttributes:
         """Bring Gaussians nearer to discs on the skin, by what is missing of the visibility.
 
         Args:
             spacing: mean distance between neighbouring anchors, m.
-            facing: (B, N) cosine between the skin's normal and the direction to the camera. Of skin
-                that no frame shows, Gaussians are discs only where it faces the camera: training
-                frames have shown them from behind. None: from everywhere.
+            behind: see `behind`; None: discs from everywhere.
         """
         kept, shape = self.offsets[side], self.shapes[side]
-        if facing is not None:
-            behind = self.behind(side, facing)
+        if behind is not None:
             kept, shape = kept + behind, shape + behind
         kept, shape = kept[..., None], shape[..., None]
         disc = raw.log_scales.new_tensor([_WIDE, _WIDE, _THIN]).mul(spacing).log() - log_scale_bias
@@ -101,8 +98,11 @@ class Visibility(Found):
     def behind(self, side: str, facing: Tensor) -> Tensor:
         """(B, N) in [0, 1], how far Gaussians of skin that no frame shows are as they were learnt.
 
+        They are discs in their changed colours only where the skin faces the camera: training
+        frames have shown them from behind. 0 for all other Gaussians.
+
         Args:
-            facing: see `settle`.
+            facing: (B, N) cosine between the skin's normal and the direction to the camera.
         """
         unseen = (self.shapes[side] <= 0.0).to(facing)
         return unseen * (1.0 - (facing / FACING).clamp(0.0, 1.0))

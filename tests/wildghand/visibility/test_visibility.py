@@ -70,7 +70,7 @@ def test_skin_that_no_frame_shows_is_as_learnt_from_behind_and_discs_from_the_fr
     # A twentieth in front of the tangent plane is half of the way to where a frame counts.
     facing = torch.tensor([-0.5, 0.0, 0.05, 0.1, 0.9]).repeat(2, 8)
     none = visibility(0.0, 0.0)
-    found = none.settle("right", raw, SPACING, bias, facing).concatenate()
+    found = none.settle("right", raw, SPACING, bias, none.behind("right", facing)).concatenate()
     learnt = visibility(1.0, 1.0).settle("right", raw, SPACING, bias).concatenate()
     discs = none.settle("right", raw, SPACING, bias).concatenate()
     half = visibility(0.5, 0.5).settle("right", raw, SPACING, bias).concatenate()
@@ -78,7 +78,7 @@ def test_skin_that_no_frame_shows_is_as_learnt_from_behind_and_discs_from_the_fr
         torch.testing.assert_close(found[near], expected[near])
     # Elsewhere the camera has no say.
     some = visibility(0.3, 0.3)
-    seen = some.settle("right", raw, SPACING, bias, facing).concatenate()
+    seen = some.settle("right", raw, SPACING, bias, some.behind("right", facing)).concatenate()
     assert torch.equal(seen, some.settle("right", raw, SPACING, bias).concatenate())
 
 
