@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from typing import Any
 
 import torch
 from torch import Tensor
 
-#: A gradient beyond this counts as not finite: float32 cannot hold its square, and a second moment
-#: that is infinite once would hold a parameter where it is for good.
+#: A gradient whose norm is beyond this counts as not finite: float32 cannot hold its square, and a
+#: second moment that is infinite once would hold a parameter where it is for good.
 LARGEST = 1e18
 
 
@@ -52,7 +51,7 @@ class ClippedAdam(torch.optim.Adam):
     def take_step(self, loss: Tensor) -> Tensor:
         """Move everything that has a gradient; nothing changes where one or the loss is not finite.
 
-        A gradient beyond `LARGEST` counts as not finite.
+        A tensor whose gradient has a norm beyond `LARGEST` counts as not finite.
 
         Nobody waits to learn whether it is: torch's fused kernels read that where it lies, as for a
         `GradScaler`, and skip the step.
@@ -68,9 +67,8 @@ class ClippedAdam(torch.optim.Adam):
                     gradients.append(parameter.grad)
         finite = loss.detach().isfinite()
         if gradients:
-            finite = (
-                finite & (torch.stack(torch._foreach_norm(gradients, math.inf)) <= LARGEST).all()
-            )
+            # The largest number would do too, and takes torch ten times as long on the CPU.
+            finite = finite & (torch.stack(torch._foreach_norm(gradients)) <= LARGEST).all()
         stopped = (~finite).float()
         if self.limit > 0.0:
             clipped = [group["params"] for group in self.param_groups if group.get("clipped", True)]
