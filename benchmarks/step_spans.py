@@ -1,14 +1,14 @@
 """Which component of a step each piece of its code belongs to, told to torch's profiler.
 
-While `marked` holds, the functions listed here open a span of the profiler. A name that is not
-there (any more) is left out; what it did is counted for the span around it.
+While `marked` holds, the functions listed here open a span of the profiler. What they do not cover is
+counted for the span around it.
 """
 
 from __future__ import annotations
 
 import functools
 import importlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -55,16 +55,20 @@ FUNCTIONS: dict[str, tuple[str, ...]] = {
         "wildghand.model.terms:reconstruction",
         "wildghand.plain.recipe:photometric_loss",
     ),
-    "regularisers": ("wildghand.fitting.objective:Objective.__call__",),
-    "targets and weights": (
-        "wildghand.fitting.weights:Weighting.__call__",
-        "wildghand.gaussians.training:FrameTable.__call__",
+    "regularisers": (
+        "wildghand.fitting.objective:Regularisers.loss",
+        "wildghand.fitting.disentangle:Dpd.loss",
+        "wildghand.fitting.objective:Regularisers.loss_of_features",
     ),
+    "shadows": ("wildghand.fitting.light:Lighting.draws", "wildghand.model.model:dimmed"),
+    "PAO": ("wildghand.fitting.weights:Pao.compare",),
+    "targets and weights": ("wildghand.gaussians.training:FrameTable.__call__",),
+    "mean of the steps": ("wildghand.fitting.choice:AveragedSteps.after_step",),
     "optimizer": (
         "torch.optim.optimizer:Optimizer.zero_grad",
         "wildghand.gaussians.adam:ClippedAdam.clear",
         "wildghand.gaussians.adam:ClippedAdam.take_step",
-        "wildghand.fitting.fit:set_rates",
+        "wildghand.fitting.descent:Descent.set_rates",
     ),
 }
 
@@ -87,16 +91,14 @@ def marked() -> Iterator[None]:
 def _mark(place: str, span: str, undo: list[Callable[[], None]]) -> None:
     module, _, path = place.partition(":")
     *owners, name = path.split(".")
-    try:
-        owner = functools.reduce(getattr, owners, importlib.import_module(module))
-        original = getattr(owner, name)
-    except (ImportError, AttributeError):
-        return
+    owner = functools.reduce(getattr, owners, importlib.import_module(module))
+    original = getattr(owner, name)
 
     @functools.wraps(original)
     def inside(*args: Any, **kwargs: Any) -> Any:
         with record_function(span):
-            return original(*args, **kwargs)
+            found = original(*args, **kwargs)
+            return list(found) if isinstance(found, Generator) else found
 
     setattr(owner, name, inside)
     undo.append(lambda: setattr(owner, name, original))
