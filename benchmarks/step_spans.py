@@ -1,7 +1,7 @@
 """Which component of a step each piece of its code belongs to, told to torch's profiler.
 
-While `marked` holds, the functions listed here open a span of the profiler. What they do not cover is
-counted for the span around it.
+While `marked` holds, the functions listed here open a span of the profiler. What they do not cover
+is counted for the span around it.
 """
 
 from __future__ import annotations
