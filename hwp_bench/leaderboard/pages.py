@@ -304,6 +304,21 @@ def _ratios(sources: Sources) -> str:
     return _markdown(table_of("Stored ratios", columns))
 
 
+def _stages(sources: Sources) -> str:
+    """The stages of `wildghand fit VIDEO` (`benchmarks/video_stages.jsonl`)."""
+    lines = (sources.root / "benchmarks" / "video_stages.jsonl").read_text("utf-8").splitlines()
+    fits = [json.loads(line) for line in lines]
+    names = list(dict.fromkeys(name for fit in fits for name in fit["stages"]))
+    columns: list[Filled] = [
+        (Column("Video"), [fit["video"] + ", quick" * fit["quick"] for fit in fits]),
+        (Column("Frames"), [fit["frames"] for fit in fits]),
+        (Column("All, s"), [round(fit["seconds"]) for fit in fits]),
+        *((Column(f"{name}, s"), [round(fit["stages"][name]) for fit in fits]) for name in names),
+        (Column("Machine, day"), [f"{fit['machine']}, {fit['day']}" for fit in fits]),
+    ]
+    return _markdown(table_of("Seconds of wildghand fit, by stage", columns))
+
+
 def _tuning(sources: Sources, method: str) -> str:
     """The logged trials of a baseline (`benchmarks/tuning.jsonl`), next to the plain fit."""
     lines = (sources.root / "benchmarks" / "tuning.jsonl").read_text("utf-8").splitlines()
@@ -345,6 +360,7 @@ BLOCKS: Mapping[str, Callable[..., str]] = {
     "headline": _headline,
     "field": _field,
     "ratios": _ratios,
+    "stages": _stages,
     "tuning": _tuning,
 }
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from made_entries import complete_results
 
+from benchmarks.video_stages import keep
 from hwp_bench.analysis.bootstrap import Estimate
 from hwp_bench.base.errors import UsageError
 from hwp_bench.cli.main import main
@@ -71,6 +72,7 @@ def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "docs/field.md": "# The field\n\n<!-- results: field -->\n<!-- end -->\n\nThe end.\n",
         "baselines/wild/README.md": "<!-- results: tuning wild -->\nold\n<!-- end -->\n",
         "docs/results.toml": TYPED,
+        "docs/video.md": "<!-- results: stages -->\n<!-- end -->\n",
         "docs/studies/one.md": "It brings 2.5 dB.\n",
     }
     for name, text in pages.items():
@@ -93,8 +95,18 @@ def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ]
     (root / "benchmarks").mkdir()
     (root / "benchmarks" / "tuning.jsonl").write_text("\n".join(lines) + "\n")
+    log = root / "benchmarks" / "video_stages.jsonl"
+    keep([video_stages(7.0, quick=False), video_stages(3.0, quick=True)], log)
+    keep([video_stages(5.4, quick=False)], log)
     write_pages(root)
     return root
+
+
+def video_stages(seconds: float, *, quick: bool) -> dict[str, object]:
+    """A run of `wildghand fit` of one video, half of which is its fit."""
+    stages = {"track": 0.5 * seconds, "fit": 0.5 * seconds}
+    made = {"video": "a.mp4", "quick": quick, "frames": 9, "seconds": seconds, "stages": stages}
+    return {**made, "commit": "c", "day": "2026-01-02", "machine": "m"}
 
 
 def cells(text: str, start: str) -> list[str]:
@@ -139,6 +151,19 @@ def test_the_first_page_has_a_line_a_suite(checkout: Path) -> None:
     own, plain = (field_results()[place].scores["psnr"] + 0.1 for place in (0, 2))
     assert row[:4] == ["mini, 8 captures", f"{own:.2f}", f"Plain, {plain:.2f}", f"{plain:.2f}"]
     assert row[5:] == ["3", "16 s", "2"]
+
+
+def test_stages_of_a_video_are_those_of_its_last_run(checkout: Path) -> None:
+    page = (checkout / "docs" / "video.md").read_text()
+    assert cells(page, "a.mp4 |") == ["a.mp4", "9", "5", "3", "3", "m, 2026-01-02"]
+    assert cells(page, "a.mp4 `--quick`") == [
+        "a.mp4 `--quick`",
+        "9",
+        "3",
+        "2",
+        "2",
+        "m, 2026-01-02",
+    ]
 
 
 def test_trials_have_means_next_to_the_plain_fit(checkout: Path) -> None:
