@@ -67,7 +67,7 @@ from hwp_bench.importers.video.usable import say_faults
 
 #: Version of the fit and the masks. It is raised when they come out otherwise for the same input,
 #: because scores on captures of two versions do not compare.
-IMPORTER_VERSION = 4
+IMPORTER_VERSION = 5
 #: What captures of it say in `CaptureInfo.made_by`.
 MADE_BY = f"video {IMPORTER_VERSION}"
 #: Frames on the overlay sheet.
