@@ -28,6 +28,7 @@ from hwp_bench.importers.shared.output import (
 )
 from hwp_bench.importers.video.glimpse import Glimpse, paint_hand
 from hwp_bench.importers.video.masks import (
+    LAST,
     NARROW,
     WIDE,
     ClipMasks,
@@ -316,7 +317,7 @@ def fit_video(
     turns.refine(*turns.cut(NARROW, stored), "outline", *["texture"] * options.fit.texture)
     if options.fit.picture_rounds > 0:
         turns.refine(*turns.cut(NARROW, stored), "pictures")
-    projected, masks = turns.cut(NARROW)
+    projected, masks = turns.cut(LAST)
     imported = {}
     for (side, landmarks), fitted, clip, first in zip(
         source.hands.items(), fits, projected.hands, first_errors, strict=True

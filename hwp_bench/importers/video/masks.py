@@ -158,9 +158,6 @@ _FOREARM = 0.2
 # How much colour counts against smoothness, over GrabCut's own balance, which closes the narrow
 # gaps between fingers.
 _COLOUR_WEIGHT = 4.0
-# How far outside the silhouette a pixel may be hand, px for each px before the wrist's line. An arm
-# leaves the hand at a wide angle; next to the wrist the mesh is off by less.
-_FLARE = 0.25
 
 
 @dataclass(frozen=True)
@@ -171,12 +168,17 @@ class MaskSettings:
     inside: float
     #: Pixels farther than this outside the silhouette are not hand.
     outside: float
+    #: Pixels outside the silhouette that are nearer to the wrist's line than so many times their
+    #: distance to the silhouette are arm: an arm may leave the hand at an angle, the mesh does not.
+    arm: float = 0.0
 
 
 #: For the first masks, made from landmarks only.
 WIDE = MaskSettings(inside=0.04, outside=0.12)
-#: For the last masks, made after the outline has been fitted.
+#: For masks made after the outline has been fitted.
 NARROW = MaskSettings(inside=0.027, outside=0.08)
+#: For the masks that are kept.
+LAST = replace(NARROW, arm=4.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,8 +267,8 @@ def _segment(
     skin = np.zeros_like(prompt.silhouette)
     cut = (labels & 1) * np.uint8(255)
     skin[open_] = _tidied(cut, prompt.silhouette[open_], hand_size)
-    # The mesh does not bend where the arm does. The silhouette's own wrist end is hand.
-    hand = distance <= np.maximum(-_FLARE * prompt.behind, 0.0)
+    # The silhouette's own wrist end is hand.
+    hand = (settings.arm * distance <= -prompt.behind) | (prompt.silhouette > 0)
     return Segmentation(skin, np.where(hand, skin, 0).astype(np.uint8))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -12,8 +13,10 @@ from synthetic_clip import CUP, HEIGHT, SKIN, WIDTH, SyntheticClip, make_clip
 from hwp_bench.hands.raster import draw_silhouette, overlap
 from hwp_bench.hands.template import boundary_vertices
 from hwp_bench.importers.video.masks import (
+    LAST,
     WIDE,
     ColourModel,
+    MaskSettings,
     Prompt,
     Segmentation,
     behind_wrist,
@@ -47,9 +50,11 @@ def prompt(frame: int, shift: float = 0.0, detected: bool = True) -> Prompt:
     )
 
 
-def masks(pictures: list[np.ndarray], shift: float = 0.0) -> list[Segmentation]:
+def masks(
+    pictures: list[np.ndarray], shift: float = 0.0, trust: MaskSettings = WIDE
+) -> list[Segmentation]:
     found = segment_clip(
-        lambda frame: pictures[frame], lambda f: prompt(f, shift), len(pictures), HAND, WIDE
+        lambda frame: pictures[frame], lambda f: prompt(f, shift), len(pictures), HAND, trust
     )
     return [segmentation for _, segmentation in found]
 
@@ -94,7 +99,7 @@ def test_an_arm_that_leaves_at_an_angle_is_no_hand() -> None:
         # The arm begins 25 px before the end of the hand, as where a wrist is bent.
         arm = np.concatenate([ring - 25 * along, ring + 300 * aside]).astype(np.float32)
         cv2.fillConvexPoly(picture, cv2.convexHull(arm).astype(np.int32), SKIN)
-    for frame, found in enumerate(masks(seen)):
+    for frame, found in enumerate(masks(seen, trust=replace(WIDE, arm=LAST.arm))):
         silhouette = prompt(frame).silhouette
         away = cv2.distanceTransform(255 - silhouette, cv2.DIST_L2, 3)
         beside = (away > 2.0) & (prompt(frame).behind <= 0)
