@@ -28,6 +28,7 @@ from hwp_bench.importers.shared.output import (
 )
 from hwp_bench.importers.video.glimpse import Glimpse, paint_hand
 from hwp_bench.importers.video.masks import (
+    LAST,
     NARROW,
     WIDE,
     ClipMasks,
@@ -67,7 +68,7 @@ from hwp_bench.importers.video.usable import say_faults
 
 #: Version of the fit and the masks. It is raised when they come out otherwise for the same input,
 #: because scores on captures of two versions do not compare.
-IMPORTER_VERSION = 4
+IMPORTER_VERSION = 5
 #: What captures of it say in `CaptureInfo.made_by`.
 MADE_BY = f"video {IMPORTER_VERSION}"
 #: Frames on the overlay sheet.
@@ -316,7 +317,7 @@ def fit_video(
     turns.refine(*turns.cut(NARROW, stored), "outline", *["texture"] * options.fit.texture)
     if options.fit.picture_rounds > 0:
         turns.refine(*turns.cut(NARROW, stored), "pictures")
-    projected, masks = turns.cut(NARROW)
+    projected, masks = turns.cut(LAST)
     imported = {}
     for (side, landmarks), fitted, clip, first in zip(
         source.hands.items(), fits, projected.hands, first_errors, strict=True

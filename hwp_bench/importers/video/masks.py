@@ -168,12 +168,17 @@ class MaskSettings:
     inside: float
     #: Pixels farther than this outside the silhouette are not hand.
     outside: float
+    #: Pixels outside the silhouette that are nearer to the wrist's line than so many times their
+    #: distance to the silhouette are arm: an arm may leave the hand at an angle, the mesh does not.
+    arm: float = 0.0
 
 
 #: For the first masks, made from landmarks only.
 WIDE = MaskSettings(inside=0.04, outside=0.12)
-#: For the last masks, made after the outline has been fitted.
+#: For masks made after the outline has been fitted.
 NARROW = MaskSettings(inside=0.027, outside=0.08)
+#: For the masks that are kept.
+LAST = replace(NARROW, arm=4.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,15 +187,10 @@ class Prompt:
 
     #: (S, S) uint8, 255 where a mesh is.
     silhouette: np.ndarray
-    #: (S, S) bool, the forearm's side of the wrist.
-    beyond: np.ndarray
+    #: (S, S) px of every pixel behind the wrist's line: above 0 on the forearm's side.
+    behind: np.ndarray
     #: Whether the pose comes from a detection, not from interpolation.
     detected: bool
-
-    @property
-    def hand_side(self) -> np.ndarray:
-        """(S, S) bool: the mask may be here; the silhouette's own wrist end included."""
-        return ~self.beyond | (self.silhouette > 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,27 +248,28 @@ def _segment(
     GrabCut (Rother et al., 2004) held fixed; OpenCV's `grabCut` in its frozen mode.
     """
     if model is None or not prompt.silhouette.any():
-        skin = prompt.silhouette
-    else:
-        inside, outside, distance = _sure(prompt, hand_size, settings)
-        labels = np.full(inside.shape, cv2.GC_PR_BGD, dtype=np.uint8)
-        labels[prompt.silhouette > 0] = cv2.GC_PR_FGD
-        labels[outside | (distance > _FOREARM * hand_size)] = cv2.GC_BGD
-        # What is surely not hand decides nothing, and costs as much as the rest.
-        open_ = surrounding(labels != cv2.GC_BGD, 2)
-        lab, labels = to_lab(image[open_]), np.ascontiguousarray(labels[open_])
-        if prompt.detected:
-            edge = max(1, round(_WINDOW * hand_size))
-            colour = cv2.blur(np.clip(evidence(lab, model), -5.0, 5.0), (edge, edge))
-            labels[inside[open_] & (colour > _FORBIDDING)] = cv2.GC_FGD
-        # The rectangle is not read in this mode; the mixtures are written to, so copies.
-        sharp = model.sharpened(_COLOUR_WEIGHT)
-        background, foreground = sharp.background, sharp.foreground
-        cv2.grabCut(lab, labels, (0, 0, 1, 1), background, foreground, 1, cv2.GC_EVAL_FREEZE_MODEL)
-        skin = np.zeros_like(prompt.silhouette)
-        cut = (labels & 1) * np.uint8(255)
-        skin[open_] = _tidied(cut, prompt.silhouette[open_], hand_size)
-    return Segmentation(skin, np.where(prompt.hand_side, skin, 0).astype(np.uint8))
+        return Segmentation(prompt.silhouette, prompt.silhouette)
+    inside, outside, distance = _sure(prompt, hand_size, settings)
+    labels = np.full(inside.shape, cv2.GC_PR_BGD, dtype=np.uint8)
+    labels[prompt.silhouette > 0] = cv2.GC_PR_FGD
+    labels[outside | (distance > _FOREARM * hand_size)] = cv2.GC_BGD
+    # What is surely not hand decides nothing, and costs as much as the rest.
+    open_ = surrounding(labels != cv2.GC_BGD, 2)
+    lab, labels = to_lab(image[open_]), np.ascontiguousarray(labels[open_])
+    if prompt.detected:
+        edge = max(1, round(_WINDOW * hand_size))
+        colour = cv2.blur(np.clip(evidence(lab, model), -5.0, 5.0), (edge, edge))
+        labels[inside[open_] & (colour > _FORBIDDING)] = cv2.GC_FGD
+    # The rectangle is not read in this mode; the mixtures are written to, so copies.
+    sharp = model.sharpened(_COLOUR_WEIGHT)
+    background, foreground = sharp.background, sharp.foreground
+    cv2.grabCut(lab, labels, (0, 0, 1, 1), background, foreground, 1, cv2.GC_EVAL_FREEZE_MODEL)
+    skin = np.zeros_like(prompt.silhouette)
+    cut = (labels & 1) * np.uint8(255)
+    skin[open_] = _tidied(cut, prompt.silhouette[open_], hand_size)
+    # The silhouette's own wrist end is hand.
+    hand = (settings.arm * distance <= -prompt.behind) | (prompt.silhouette > 0)
+    return Segmentation(skin, np.where(hand, skin, 0).astype(np.uint8))
 
 
 def to_lab(image: np.ndarray) -> np.ndarray:
@@ -284,7 +285,7 @@ def _sure(
     distance = cv2.distanceTransform(255 - prompt.silhouette, cv2.DIST_L2, 3)
     return (
         depth > settings.inside * hand_size,
-        (distance > settings.outside * hand_size) & ~prompt.beyond,
+        (distance > settings.outside * hand_size) & (prompt.behind <= 0.0),
         distance,
     )
 
@@ -375,18 +376,18 @@ class ProjectedHands:
         for hand, shown in zip(self.hands, self.shown[:, frame], strict=True):
             if shown:
                 pixels = hand.in_crop(frame, edge)
-                beyond = beyond_wrist(hand.vertices[frame], pixels, hand.ring, edge)
-                prompts.append(Prompt(hand.silhouette(frame, edge), beyond, detected))
+                behind = behind_wrist(hand.vertices[frame], pixels, hand.ring, edge)
+                prompts.append(Prompt(hand.silhouette(frame, edge), behind, detected))
         if not prompts:
             nothing = np.zeros((edge, edge), dtype=np.uint8)
-            return Prompt(nothing, nothing > 0, detected)
+            return Prompt(nothing, np.full(nothing.shape, -np.inf), detected)
         if len(prompts) == 1:
             return prompts[0]
         first, second = prompts
         nearer = _distance(first.silhouette) <= _distance(second.silhouette)
         return Prompt(
             np.maximum(first.silhouette, second.silhouette),
-            np.where(nearer, first.beyond, second.beyond),
+            np.where(nearer, first.behind, second.behind),
             detected,
         )
 
@@ -458,25 +459,29 @@ def _distance(silhouette: np.ndarray) -> np.ndarray:
     return cv2.distanceTransform(255 - silhouette, cv2.DIST_L2, 3)
 
 
-def beyond_wrist(
+def behind_wrist(
     vertices: np.ndarray, pixels: np.ndarray, ring: np.ndarray, size: int
 ) -> np.ndarray:
-    """Pixels (size, size) bool on the forearm's side of the wrist.
+    """Distances (size, size) px of pixels behind the wrist, towards the forearm.
 
     The open end of the mesh spans a plane; its normal points along the forearm. Seen at the
     wrist's depth, the plane cuts the image in a line, and the forearm lies behind the line. A
-    mesh without an open end, or seen straight along the forearm, has no such line.
+    mesh without an open end, or seen straight along the forearm, has no such line: all -inf.
     """
+    nowhere = np.full((size, size), -np.inf)
     if len(ring) < 3:
-        return np.zeros((size, size), dtype=bool)
+        return nowhere
     centre = vertices[ring].mean(axis=0)
     normal = np.linalg.svd(vertices[ring] - centre)[2][2]
     if normal @ (vertices.mean(axis=0) - centre) > 0:
         normal = -normal
+    seen = np.linalg.norm(normal[:2])
+    if seen == 0:
+        return nowhere
     middle = pixels[ring].mean(axis=0)
     along = np.arange(size) + 0.5
-    depth = (along[None] - middle[0]) * normal[0] + (along[:, None] - middle[1]) * normal[1]
-    return depth > 0
+    x, y = normal[:2] / seen
+    return np.asarray((along[None] - middle[0]) * x + (along[:, None] - middle[1]) * y)
 
 
 # --- Masks of a clip

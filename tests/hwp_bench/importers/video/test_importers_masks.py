@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 
 import cv2
 import numpy as np
 from scipy.stats import multivariate_normal
-from synthetic_clip import CUP, HEIGHT, WIDTH, SyntheticClip, make_clip
+from synthetic_clip import CUP, HEIGHT, SKIN, WIDTH, SyntheticClip, make_clip
 
 from hwp_bench.hands.raster import draw_silhouette, overlap
 from hwp_bench.hands.template import boundary_vertices
 from hwp_bench.importers.video.masks import (
+    LAST,
     WIDE,
     ColourModel,
+    MaskSettings,
     Prompt,
     Segmentation,
-    beyond_wrist,
+    behind_wrist,
     evidence,
     learn_colours,
     segment_clip,
@@ -42,14 +45,16 @@ def prompt(frame: int, shift: float = 0.0, detected: bool = True) -> Prompt:
     ring = boundary_vertices(known.template.faces)
     return Prompt(
         draw_silhouette(pixels, known.template.faces, WIDTH),
-        beyond_wrist(known.vertices[frame], pixels, ring, WIDTH),
+        behind_wrist(known.vertices[frame], pixels, ring, WIDTH),
         detected,
     )
 
 
-def masks(pictures: list[np.ndarray], shift: float = 0.0) -> list[Segmentation]:
+def masks(
+    pictures: list[np.ndarray], shift: float = 0.0, trust: MaskSettings = WIDE
+) -> list[Segmentation]:
     found = segment_clip(
-        lambda frame: pictures[frame], lambda f: prompt(f, shift), len(pictures), HAND, WIDE
+        lambda frame: pictures[frame], lambda f: prompt(f, shift), len(pictures), HAND, trust
     )
     return [segmentation for _, segmentation in found]
 
@@ -78,9 +83,28 @@ def test_the_mask_is_not_swollen() -> None:
 
 def test_the_forearm_is_skin_but_no_hand() -> None:
     found = masks(pictures())[0]
-    beyond = prompt(0).beyond
+    beyond = prompt(0).behind > 0
     assert np.count_nonzero(found.skin[beyond]) > 500
     assert np.count_nonzero(found.hand[beyond & (prompt(0).silhouette == 0)]) == 0
+
+
+def test_an_arm_that_leaves_at_an_angle_is_no_hand() -> None:
+    """Oracle: the silhouette that the picture is painted with. Fewer than 20 px are farther out."""
+    known, seen = clip(), pictures()
+    for frame, picture in enumerate(seen):
+        ring = known.vertex_pixels[frame][boundary_vertices(known.template.faces)]
+        wrist, knuckle = ring.mean(axis=0), known.landmarks.image[frame, 9]
+        along = (wrist - knuckle) / np.linalg.norm(wrist - knuckle)
+        aside = along + np.array([-along[1], along[0]])
+        # The arm begins 25 px before the end of the hand, as where a wrist is bent.
+        arm = np.concatenate([ring - 25 * along, ring + 300 * aside]).astype(np.float32)
+        cv2.fillConvexPoly(picture, cv2.convexHull(arm).astype(np.int32), SKIN)
+    for frame, found in enumerate(masks(seen, trust=replace(WIDE, arm=LAST.arm))):
+        silhouette = prompt(frame).silhouette
+        away = cv2.distanceTransform(255 - silhouette, cv2.DIST_L2, 3)
+        beside = (away > 2.0) & (prompt(frame).behind <= 0)
+        assert np.count_nonzero(found.skin[beside]) > 150
+        assert np.count_nonzero(found.hand[away > 2.0]) < 20
 
 
 def test_an_object_before_the_hand_stays_out() -> None:
@@ -97,7 +121,7 @@ def test_an_object_before_the_hand_stays_out() -> None:
 
 def test_nothing_is_invented_where_no_hand_is_drawn() -> None:
     known = clip()
-    empty = Prompt(np.zeros((WIDTH, WIDTH), np.uint8), np.zeros((WIDTH, WIDTH), dtype=bool), False)
+    empty = Prompt(np.zeros((WIDTH, WIDTH), np.uint8), np.full((WIDTH, WIDTH), -np.inf), False)
     found = list(
         segment_clip(
             lambda frame: square(known.picture(frame)),
@@ -126,11 +150,11 @@ def test_masks_repeat_exactly() -> None:
 def test_evidence_has_the_sign_of_the_colour() -> None:
     picture = to_lab(pictures()[0])
     hand = square(clip().silhouette(0)) > 0
-    model = learn_colours([(picture[hand], picture[~hand & ~prompt(0).beyond])])
+    model = learn_colours([(picture[hand], picture[~hand & (prompt(0).behind <= 0)])])
     assert model is not None
     value = evidence(picture, model)
     assert (value[hand] > 0).mean() > 0.99
-    assert (value[~hand & ~prompt(0).beyond] < 0).mean() > 0.97
+    assert (value[~hand & (prompt(0).behind <= 0)] < 0).mean() > 0.97
     assert learn_colours([(picture[hand & False], picture[~hand])]) is None
 
 

@@ -9,7 +9,7 @@ from synthetic_clip import FOCAL, HEIGHT, WIDTH, disc, make_clip, template
 
 from hwp_bench.hands.articulation import joint_axes
 from hwp_bench.hands.template import boundary_vertices
-from hwp_bench.importers.video.masks import beyond_wrist
+from hwp_bench.importers.video.masks import behind_wrist
 from hwp_bench.importers.video.model import ClipModel, RigidStart
 from hwp_bench.importers.video.residuals import (
     FIELD_SIZE,
@@ -99,13 +99,13 @@ def test_the_forearm_lies_beyond_the_wrist() -> None:
     ring = boundary_vertices(clip.template.faces)
     for frame in range(3):
         pixels = clip.vertex_pixels[frame]
-        beyond = beyond_wrist(clip.vertices[frame], pixels, ring, 320)
+        behind = behind_wrist(clip.vertices[frame], pixels, ring, 320)
         x, y = clip.landmarks.image[frame, 9].astype(int)
-        assert not beyond[y, x]
+        assert behind[y, x] < 0
         wrist = pixels[ring].mean(axis=0)
         x, y = (wrist + 0.4 * (wrist - clip.landmarks.image[frame, 9])).astype(int)
-        assert beyond[y, x]
-    assert not beyond_wrist(clip.vertices[0], pixels, ring[:2], 320).any()
+        assert behind[y, x] > 0
+    assert (behind_wrist(clip.vertices[0], pixels, ring[:2], 320) < 0).all()
 
 
 def model(side: str, fingers: np.ndarray) -> ClipModel:
