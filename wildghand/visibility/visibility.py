@@ -108,6 +108,10 @@ class Visibility(Found):
         unseen = (self.shapes[side] <= 0.0).to(facing)
         return unseen * (1.0 - (facing / FACING).clamp(0.0, 1.0))
 
+    def shown(self, side: str) -> Tensor:
+        """(N,) in [0, 1], how well frames show Gaussians: the share of the offsets, 0 if unseen."""
+        return self.offsets[side] * (self.shapes[side] > 0.0)
+
     def spare(self, chosen: Mapping[str, Tensor]) -> Visibility:
         """Keep all of some Gaussians.
 
