@@ -41,8 +41,8 @@ class RawAttributes:
     logit_opacities: Tensor
     #: (..., N, 3) sRGB colour before the sigmoid.
     logit_colors: Tensor
-    # What `split` has made them of: `concatenate` need not make it again.
-    _joined: Tensor | None = field(default=None, repr=False)
+    # What `split` has made them of: `concatenate` need not make it again. `replace` drops it.
+    _joined: Tensor | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
         for name, tensor in self.items():
@@ -82,7 +82,9 @@ class RawAttributes:
                 f"are {tuple(channels.shape)}, expected (..., N, {CHANNELS})", field="channels"
             )
         parts = channels.split(list(SIZES.values()), dim=-1)
-        return cls(**dict(zip(SIZES, parts, strict=True)), _joined=channels)
+        made = cls(**dict(zip(SIZES, parts, strict=True)))
+        object.__setattr__(made, "_joined", channels)
+        return made
 
 
 @dataclass(frozen=True, eq=False)

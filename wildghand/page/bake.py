@@ -2,9 +2,12 @@
 
 Most of a compact network sees no pose: for each Gaussian it comes down to 14 numbers. What does
 see the pose (the geometry branch and what the heads make of it) is a few small layers, which the
-page evaluates at each Gaussian. A network that is too large for that is drawn in many poses
-instead, and what it says becomes a mean and principal components, whose coefficients are regressed
-on the rotations of the joints (`PoseBasis`).
+page evaluates at each Gaussian. How the network corrects the pose follows from the mean of the
+geometry branch, which the page finds at some Gaussians (`refinement_content`).
+
+A network that is too large for that is drawn in many poses instead. What it says becomes a mean and
+principal components, whose coefficients, as the corrections, are regressed on the rotations of the
+joints (`PoseBasis`).
 """
 
 from __future__ import annotations
@@ -19,9 +22,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from hwp_bench.base.arrays import evenly
 from hwp_bench.hands.articulation import axis_angle_to_matrix
 from wildghand.avatar import WildGHandAvatar
 from wildghand.gaussians.attributes import CHANNELS, RawAttributes
+from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.model.wrist import DEPTH, OPAQUE, SPACING, THIN, WIDE, WristWall
 from wildghand.network import HandFeatures
 from wildghand.network.branches import CompactGeometry
@@ -38,6 +43,9 @@ _HARMONICS, _MOST_WEIGHTS = 16, 2048
 _CORRECTIVES, _MOST_CORRECTIVES, _JOINTS = 32, 1_000_000, 4
 # Poses that are asked for together.
 _CHUNK = 8
+# Gaussians whose weighted mean is that of all, poses in which their weights are found, and the
+# ridge that keeps these near to each other, in the mean size of the normal matrix's diagonal.
+_HEARD, _WEIGHED, _EVEN = 256, 16, 0.1
 
 
 def pack(array: np.ndarray) -> str:
@@ -99,8 +107,9 @@ def network_content(avatar: WildGHandAvatar) -> dict[str, Any] | None:
         "hidden": hidden,
         "weights": _real(weights),
         "frequencies": branch.frequencies,
-        "posture": _real(_wider(branch.pose.weight.T, 4 * points)),
-        "bias": _wider(branch.place.bias[None], 4 * points)[0].tolist(),
+        "posture": _linear(
+            _wider(branch.pose.weight.T, 4 * points), _wider(branch.place.bias[None], 4 * points)
+        ),
     }
 
 
@@ -117,6 +126,55 @@ def _wider(matrix: Tensor, columns: int) -> Tensor:
 def _real(values: Tensor | np.ndarray) -> str:
     array = values.detach().cpu().numpy() if isinstance(values, Tensor) else values
     return pack(array.astype("<f4"))
+
+
+def _linear(weights: Tensor | np.ndarray, bias: Tensor | np.ndarray) -> dict[str, str]:
+    """A linear layer: (inputs, outputs) weights and a bias."""
+    return {"weights": _real(weights), "bias": _real(bias)}
+
+
+@torch.no_grad()
+def refinement_content(
+    avatar: WildGHandAvatar, side: str, poses: np.ndarray, features: HandFeatures
+) -> dict[str, Any]:
+    """How a network whose layers the page holds corrects a pose (head iv).
+
+    The head reads the mean of the geometry features of all Gaussians. The page takes a weighted
+    mean of M of them. In the given poses, (P, 16, 3) rad, it is nearly that of all: ridge
+    regression of the P means, from equal weights.
+    """
+    network, rig = avatar.model.network, avatar.model.rigs[side]
+    branch, settings = network.geometry_branch, network.settings
+    assert isinstance(branch, CompactGeometry)
+    chosen = evenly(len(rig), _HEARD)
+    seen, means = [], []
+    for part in poses[evenly(len(poses), _WEIGHED)]:
+        pose = torch.as_tensor(part[None], dtype=torch.float32).to(features.betas)
+        betas = torch.as_tensor(avatar.betas[side], dtype=torch.float32).to(pose)
+        normals = quat_third_axis(rig.pose(pose, betas, pose.new_zeros(1, 3)).orientations)
+        found = network.geometry(side, normals, pose)[0].double().cpu().numpy()
+        seen.append(found[chosen].T)
+        means.append(found.mean(axis=0))
+    matrix, mean = np.concatenate(seen), np.concatenate(means)
+    normal, equal = matrix.T @ matrix, np.full(len(chosen), 1.0 / len(chosen))
+    ridge = _EVEN * np.trace(normal) / len(normal) * np.eye(len(normal))
+    weights = equal + np.linalg.solve(normal + ridge, matrix.T @ (mean - matrix @ equal))
+    first, last = _first(network.refinement_head.frame), network.refinement_head.frame[-1]
+    assert isinstance(last, nn.Linear)
+    of_hand, of_pose = first.weight.split([len(features.mean), branch.channels], dim=1)
+    chart = network.charts[side]
+    assert isinstance(chart, Chart)
+    return {
+        "chosen": chosen.tolist(),
+        "shares": weights.tolist(),
+        "light": branch.normal.in_features,
+        "places": _real(chart.coordinates[chosen] @ branch.place.weight.T),
+        "normal": _linear(branch.normal.weight.T, torch.zeros(branch.mix.in_features)),
+        "mix": _linear(branch.mix.weight.T, branch.mix.bias),
+        "first": _linear(of_pose.T, first.bias + of_hand @ features.mean),
+        "last": _linear(last.weight.T, last.bias),
+        "bounds": [settings.max_pose, settings.max_transl],
+    }
 
 
 def light_content(avatar: WildGHandAvatar) -> dict[str, Any]:
@@ -146,7 +204,7 @@ def hand_content(
     """One hand; lengths in m. The discs that close the open end of its wrist come last.
 
     Args:
-        poses: (P, 16, 3) rad, from which is learnt what only follows from the pose.
+        poses: (P, 16, 3) rad, in which the network is asked.
         tabled: the network is too large for the page.
         rank: principal components of what such a network says.
     """
@@ -154,7 +212,9 @@ def hand_content(
     rig, network, wall = model.rigs[side], model.network, model.wall(side)
     features, behind = network.features(side), _unseen(avatar, side)
     betas = torch.as_tensor(avatar.betas[side], dtype=torch.float32).to(features.betas)
-    steps, said = _sample(avatar, side, poses, features, behind, tabled=tabled)
+    steps, said = None, None
+    if tabled:
+        steps, said = _sample(avatar, side, poses, features, behind)
     shape = betas + features.betas if settings.heads else betas
     template = rig.template
     rest = template.vertices + template.shape_basis @ shape
@@ -162,7 +222,7 @@ def hand_content(
     corners = faces[torch.as_tensor(rig.anchors.face_index).cpu().numpy()]
     mix = torch.as_tensor(rig.anchors.barycentric).cpu().numpy()
     count = len(rig)
-    if tabled:
+    if said is not None:
         base = said.mean(axis=0)[:, :CHANNELS]
     else:
         raw = network.attributes_of_texture(side, features)
@@ -223,9 +283,17 @@ def hand_content(
             math.log(network.activation.min_scale),
             math.log(network.activation.max_scale),
         ],
-        "steps": None if steps is None else _real(_ridge(pose_features(poses), steps)),
-        "table": pose_basis(said, poses, rank).content() if tabled else None,
+        "refined": None
+        if tabled or not settings.heads
+        else refinement_content(avatar, side, poses, features),
+        "steps": None if steps is None else _regression(poses, steps),
+        "table": None if said is None else pose_basis(said, poses, rank).content(),
     }
+
+
+def _regression(poses: np.ndarray, targets: np.ndarray) -> dict[str, str]:
+    found = _ridge(pose_features(poses), targets)
+    return _linear(found[:-1], found[-1])
 
 
 def _sample(
@@ -234,8 +302,6 @@ def _sample(
     poses: np.ndarray,
     features: HandFeatures,
     behind: torch.Tensor,
-    *,
-    tabled: bool,
 ) -> tuple[np.ndarray | None, np.ndarray]:
     """In P poses: (P, 51) corrections of pose and translation, None without; and what is tabled.
 
@@ -248,14 +314,13 @@ def _sample(
         anchors = rig.pose(part, betas, part.new_zeros(len(part), 3))
         made = model.predict(side, anchors, part, features)
         steps.append(torch.cat([made.refinement.pose.flatten(1), made.refinement.transl], dim=1))
-        if tabled:
-            raw = made.raw
-            if model.color_changes is not None:
-                raw = model.color_changes.color(side, raw, behind)
-            log = made.shadow.clamp(min=1e-4).log()
-            said.append(torch.cat([raw.concatenate(), log], dim=-1).cpu().numpy())
+        raw = made.raw
+        if model.color_changes is not None:
+            raw = model.color_changes.color(side, raw, behind)
+        log = made.shadow.clamp(min=1e-4).log()
+        said.append(torch.cat([raw.concatenate(), log], dim=-1).cpu().numpy())
     found = torch.cat(steps).cpu().numpy() if avatar.settings.heads else None
-    return found, np.concatenate(said) if said else np.zeros((0, len(rig), CHANNELS + 1))
+    return found, np.concatenate(said)
 
 
 def _unseen(avatar: WildGHandAvatar, side: str) -> torch.Tensor:
@@ -346,7 +411,7 @@ class PoseBasis:
             "mean": _real(self.mean),
             "basis": pack(self.basis),
             "steps": self.steps.tolist(),
-            "regression": _real(self.regression),
+            "regression": _linear(self.regression[:-1], self.regression[-1]),
             "bounds": self.bounds.tolist(),
         }
 

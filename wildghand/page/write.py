@@ -133,7 +133,7 @@ def best_start(
         like = next(iter(anchors.values())).positions
         seen = seen_anchors(anchors, viewmat.to(like), K.to(like), torch.Size([_JUDGED] * 2))
         return sum(
-            float((facing[0] * (2.0 * visibility.offsets[side] - 1.0)).sum())
+            float((facing[0] * (2.0 * visibility.shown(side) - 1.0)).sum())
             for side, (_, facing) in seen.items()
         )
 

@@ -79,7 +79,8 @@ class Visibility(Found):
         """
         kept, shape = self.offsets[side], self.shapes[side]
         if behind is not None:
-            kept, shape = kept + behind, shape + behind
+            # All of an offset is kept already where a fit keeps offsets as they were learnt.
+            kept, shape = torch.maximum(kept, behind), torch.maximum(shape, behind)
         kept, shape = kept[..., None], shape[..., None]
         disc = raw.log_scales.new_tensor([_WIDE, _WIDE, _THIN]).mul(spacing).log() - log_scale_bias
         # A quaternion and its negative turn alike: the one near the identity is the shorter way.
@@ -106,6 +107,10 @@ class Visibility(Found):
         """
         unseen = (self.shapes[side] <= 0.0).to(facing)
         return unseen * (1.0 - (facing / FACING).clamp(0.0, 1.0))
+
+    def shown(self, side: str) -> Tensor:
+        """(N,) in [0, 1], how well frames show Gaussians: the share of the offsets, 0 if unseen."""
+        return self.offsets[side] * (self.shapes[side] > 0.0)
 
     def spare(self, chosen: Mapping[str, Tensor]) -> Visibility:
         """Keep all of some Gaussians.

@@ -1,7 +1,7 @@
 """The page of an avatar. Oracles: `WildGHandAvatar.render` in the same pose and camera, the model
 with its biases, cv2.projectPoints.
 
-Tolerance: 37 dB over the hand's box, which is the mean error of 3.6 grey levels.
+Tolerance: 42 dB over the hand's box, which is the mean error of 2.0 grey levels.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ QUICK: dict[str, Any] = {**TINY, "gaussians": 600}
 SMALL = PageSettings(still_size=48)
 # Nothing turns by itself.
 STILL = ("--force-prefers-reduced-motion",)
-LEAST = 37.0
+LEAST = 42.0
 
 
 def psnr(found: np.ndarray, truth: np.ndarray, coverage: np.ndarray) -> float:
@@ -56,13 +56,24 @@ def psnr(found: np.ndarray, truth: np.ndarray, coverage: np.ndarray) -> float:
 
 @pytest.fixture(scope="module")
 def fitted(make_painted: Callable[..., Capture]) -> tuple[WildGHandAvatar, Capture]:
-    """An avatar whose biases and gains are large, as those of a dark frame would be."""
+    """An avatar whose biases and gains are large, as those of a dark frame would be.
+
+    It corrects poses and changes colours by as much as a long fit does, and skin that no frame
+    shows keeps its offsets.
+    """
     capture = make_painted()
     avatar = wildghand.fit(capture.root, settings=QUICK, steps=60, all_frames=True)
+    model, random = avatar.model, torch.Generator().manual_seed(0)
     with torch.no_grad():
-        avatar.model.biases_of("right").psi.bias.fill_(1.0)
-        gains = avatar.model.log_gains
+        model.biases_of("right").psi.bias.fill_(1.0)
+        gains = model.log_gains
         gains.copy_(torch.linspace(-0.5, 0.2, gains.numel()).reshape(gains.shape))
+        model.network.refinement_head.frame[-1].weight.normal_(0.0, 0.2, generator=random)
+        count = len(model.rigs["right"])
+        model.keep(ColorChanges({"right": 0.3 * torch.randn(count, 3, generator=random)}))
+        found = model.visibility
+        kept = found.offsets["right"].masked_fill(found.shapes["right"] <= 0.0, 1.0)
+        model.keep(dataclasses.replace(found, offsets={"right": kept}))
     return avatar, capture
 
 
@@ -120,8 +131,19 @@ def test_the_page_draws_a_hand_from_where_no_camera_stood(turn: int, opened, fit
     opened.execute_script("avatar.setPose(arguments[0])", given)
     truth = avatar.render({"right": hand}, moved)
     found = drawn(opened, SimpleNamespace(camera=lambda frame: moved), frame)
-    # The light of unknown normals differs by some hundredths.
-    assert psnr(found, truth[..., :3], truth[..., 3]) > 30.0
+    assert psnr(found, truth[..., :3], truth[..., 3]) > LEAST
+
+
+@pytest.mark.parametrize("turn", [0, 90, 180])
+@pytest.mark.parametrize("pose", ["rest", "fist", "open"])
+def test_the_page_draws_free_poses_as_the_avatar(pose: str, turn: int, opened, fitted) -> None:
+    avatar, camera = fitted[0], fitted[0].studio.camera(176, 176)
+    hand = avatar.studio.posed(pose, turn)["right"]
+    given = {"right": [hand.pose.tolist(), hand.transl.tolist()]}
+    opened.execute_script("avatar.setPose(arguments[0])", given)
+    truth = avatar.render({"right": hand}, camera)
+    found = drawn(opened, SimpleNamespace(camera=lambda frame: camera), 0)
+    assert psnr(found, truth[..., :3], truth[..., 3]) > LEAST
 
 
 def biased(avatar: WildGHandAvatar, capture: Capture, frame: int) -> np.ndarray:
@@ -130,7 +152,7 @@ def biased(avatar: WildGHandAvatar, capture: Capture, frame: int) -> np.ndarray:
     rows, camera = torch.tensor([avatar.record.frames.index(frame)]), capture.camera(frame)
     with torch.no_grad():
         viewmats = torch.as_tensor(camera.viewmat[None], dtype=torch.float32)
-        made, _ = avatar.model.gaussians("right", *given, rows=rows, viewmats=viewmats)
+        made, _ = avatar.model.gaussians("right", *given, refine=True, rows=rows, viewmats=viewmats)
         image, cover, _ = rasterize(
             made.means,
             made.quats,
@@ -276,7 +298,7 @@ def test_a_page_opens_on_skin_that_frames_show(fitted) -> None:
     camera = avatar.studio.camera(64, 64)
     marked = copy.deepcopy(avatar)
     # Skin that frames show is white, other skin black.
-    kept = marked.model.visibility.offsets["right"][:, None]
+    kept = marked.model.visibility.shown("right")[:, None]
     marked.model.keep(ColorChanges({"right": (40.0 * (kept - 0.5)).clamp(-9, 9).expand(-1, 3)}))
 
     def white_less_black(hands) -> float:

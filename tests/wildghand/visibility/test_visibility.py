@@ -76,6 +76,10 @@ def test_skin_that_no_frame_shows_is_as_learnt_from_behind_and_discs_from_the_fr
     half = visibility(0.5, 0.5).settle("right", raw, SPACING, bias).concatenate()
     for expected, near in ((learnt, facing <= 0.0), (half, facing == 0.05), (discs, facing >= 0.1)):
         torch.testing.assert_close(found[near], expected[near])
+    # Offsets may be kept as they were learnt everywhere: then no share of them is added.
+    whole = visibility(1.0, 0.0)
+    found = whole.settle("right", raw, SPACING, bias, whole.behind("right", facing)).concatenate()
+    torch.testing.assert_close(found[facing <= 0.0], learnt[facing <= 0.0])
     # Elsewhere the camera has no say.
     some = visibility(0.3, 0.3)
     seen = some.settle("right", raw, SPACING, bias, some.behind("right", facing)).concatenate()
@@ -89,7 +93,9 @@ def test_unseen_skin_that_faces_away_keeps_the_colours_that_were_learnt() -> Non
     expected = torch.tensor([1.0, 1.0, 0.5, 0.0, 0.0]).repeat(2, 8)
     torch.testing.assert_close(behind, expected)
     changes = ColorChanges({"right": torch.ones(40, 3)})
-    found = changes.color("right", raw, behind).logit_colors - raw.logit_colors
+    colored = changes.color("right", raw, behind)
+    torch.testing.assert_close(colored.concatenate()[..., 11:], colored.logit_colors)
+    found = colored.logit_colors - raw.logit_colors
     torch.testing.assert_close(found, (1.0 - expected)[..., None].expand_as(found))
     assert not visibility(0.3, 0.3).behind("right", facing).any()
 

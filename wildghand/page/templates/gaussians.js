@@ -157,7 +157,7 @@ void carryOn(int row, Place own) {
 void settle(vec2 kept, float facing, vec3 change) {
   if (kept.y <= 0.0) {
     float front = clamp(facing / 0.1, 0.0, 1.0);
-    kept = vec2(1.0 - front);
+    kept = max(kept, 1.0 - front);
     raw[2].w += front * change.x;
     raw[3].xy += front * change.yz;
   }
@@ -266,7 +266,7 @@ class Gaussians {
       gl.bindBufferBase(gl.UNIFORM_BUFFER, i, buffer);
       gl.uniformBlockBinding(this.poser, gl.getUniformBlockIndex(this.poser, name), i);
     });
-    if (network) this.posture = unpack(network.posture, Float32Array);
+    if (network) this.posture = linear(network.posture);
     this.made = this.buffer(16 * this.count);
     this.bare = gl.createVertexArray();
     if (cast) this.makeShadows();
@@ -327,13 +327,13 @@ class Gaussians {
     const out = new Float32Array(36 * this.count);
     let row = 0, vertex = 0;
     for (const hand of this.hands) {
-      const { data } = hand, corners = unpack(data.corners, Uint16Array), mix = unpack(data.mix, Uint16Array);
+      const { data, corners, mix } = hand;
       const base = whole(data.base), places = whole(data.places), shifts = whole(data.shifts);
       const changes = whole(data.changes);
       const kept = unpack(data.kept, Uint8Array), trusted = data.trusted && unpack(data.trusted, Uint8Array);
       Object.assign(hand, { first: row, firstVertex: vertex });
       for (let n = 0, o = 36 * row; n < hand.count; n++, o += 36) {
-        const skin = n < hand.skin, k = kept[2 * n] / 255;
+        const skin = n < hand.skin, k = kept[2 * n] / 255, shown = kept[2 * n + 1] ? k : 0;
         for (let i = 0; i < 3; i++) out[o + i] = corners[3 * n + i] + vertex;
         const shares = [mix[2 * n] / 65535, mix[2 * n + 1] / 65535];
         out.set([...shares, 0, k, kept[2 * n + 1] / 255], o + 3);
@@ -341,7 +341,7 @@ class Gaussians {
         if (skin) out.set(places.subarray(5 * n, 5 * n + 5), o + 22);
         // Of frames f and their half h a fit keeps k = f / (f + h); it has seen f / h.
         const weight = trusted && trusted[n] < 255 ? trusted[n] / 254 : 2;
-        out.set([weight, ...shifts.subarray(3 * n, 3 * n + 3), Math.min(k / Math.max(1 - k, 1e-6), 1)], o + 27);
+        out.set([weight, ...shifts.subarray(3 * n, 3 * n + 3), Math.min(shown / Math.max(1 - shown, 1e-6), 1)], o + 27);
         out.set(changes.subarray(3 * n, 3 * n + 3), o + 32);
       }
       for (const n of data.lenders) out[36 * (row + n) + 5] = 1;
@@ -411,10 +411,12 @@ class Gaussians {
   // look: eye (3), extra [x, y, z, strength], shown, marked.
   pose(turn, centre, look) {
     const gl = this.gl, poses = this.hands.map((hand) => hand.turned(turn, centre));
-    this.hands.forEach((hand, i) => hand.write(this.surface, hand.firstVertex, poses[i]));
+    const postures = poses.map(({ vectors }) => this.postureOf(vectors));
+    const refined = this.hands.map((hand, i) => hand.refined(poses[i], this.surface, postures[i]));
+    this.hands.forEach((hand, i) => hand.write(this.surface, hand.firstVertex, refined[i]));
     this.upload(this.textures.vertices, this.surface);
     if (this.lamps[0]) this.castShadows();
-    this.hands.forEach((hand, i) => this.poseHand(hand, poses[i], look));
+    this.hands.forEach((hand, i) => this.poseHand(hand, poses[i].turns, postures[i], look));
     // They are sorted here, and the discs in a wrist get the median colour of the skin around it.
     gl.bindBuffer(gl.COPY_READ_BUFFER, this.made);
     gl.getBufferSubData(gl.COPY_READ_BUFFER, 0, this.data);
@@ -427,9 +429,9 @@ class Gaussians {
       }
     this.upload(this.textures.made, this.data);
   }
-  poseHand(hand, pose, look) {
+  poseHand(hand, turns, posture, look) {
     const gl = this.gl, { network, light } = this.content;
-    if (hand.table) this.fill(hand, hand.table.at(pose.turns));
+    if (hand.table) this.fill(hand, hand.table.at(turns));
     const biased = look.shown === "biases" && hand.data.biases;
     if (biased) this.prepareBiases(hand);
     const at = this.use(this.poser, ["gaussians", "vertices", "lights", "darks", "bones"]);
@@ -438,7 +440,7 @@ class Gaussians {
     const middle = hand.border.length && !biased ? hand.firstVertex + hand.rest.length / 3 : -1;
     gl.uniform1i(at("middle"), middle);
     gl.uniform1i(at("networked"), network ? 1 : 0);
-    if (network) gl.uniform4fv(at("posture"), this.postureOf(pose.vectors));
+    if (network) gl.uniform4fv(at("posture"), posture);
     gl.uniform4fv(at("disc"), [...hand.data.disc, 0, 0]);
     gl.uniform4fv(at("activation"), hand.data.activation);
     gl.uniform2iv(at("lamps"), this.lamps);
@@ -460,16 +462,10 @@ class Gaussians {
   }
   // The encoded pose through its layer: sines and cosines of pi 2^k v / (2 pi).
   postureOf(vectors) {
-    const { bias, frequencies } = this.content.network, sums = Float32Array.from(bias), width = sums.length;
-    vectors.flat().forEach((v, i) => {
-      for (let k = 0; k < frequencies; k++) {
-        const angle = 0.5 * v * 2 ** k, row = i * frequencies + k;
-        const parts = [[Math.sin(angle), row], [Math.cos(angle), 48 * frequencies + row]];
-        for (const [value, r] of parts)
-          for (let o = 0; o < width; o++) sums[o] += value * this.posture[r * width + o];
-      }
-    });
-    return sums;
+    if (!this.posture) return [];
+    const angles = vectors.flat().flatMap((v) =>
+      Array.from({ length: this.content.network.frequencies }, (_, k) => 0.5 * v * 2 ** k));
+    return this.posture([...angles.map(Math.sin), ...angles.map(Math.cos)]);
   }
   // Put 15 numbers of each Gaussian of the skin into its texels: attributes, and the log of the shadow.
   fill(hand, values) {

@@ -47,12 +47,63 @@ function logarithm(m) {
 function whole({ low, step, whole }) {
   return Float32Array.from(unpack(whole, Uint16Array), (v, i) => low[i % low.length] + step[i % low.length] * v);
 }
-// Sums of (145, K) weights of the rotations of the joints, row by row, and of a one.
-function regress(weights, count, turns) {
-  const sums = Array.from(weights.subarray(144 * count));
-  for (let f = 0; f < 144; f++)
-    for (let k = 0; k < count; k++) sums[k] += turns[(f / 9) | 0][f % 9] * weights[f * count + k];
-  return sums;
+// A function that applies a linear layer: (inputs, outputs) weights and a bias.
+function linear(data) {
+  const weights = unpack(data.weights, Float32Array), bias = unpack(data.bias, Float32Array);
+  const width = bias.length, inputs = weights.length / width;
+  return (values, sums = new Float64Array(width)) => {
+    sums.set(bias);
+    for (let i = 0, k = 0; i < inputs; i++)
+      for (let o = 0, v = values[i]; o < width; o++, k++) sums[o] += v * weights[k];
+    return sums;
+  };
+}
+const silu = (v) => v / (1 + Math.exp(-v));
+// wildghand/gaussians/shading.py, without the constant one.
+function harmonics(x, y, z) {
+  const s = Math.sqrt(3), a = Math.sqrt(15), b = Math.sqrt(17.5) / 2, c = Math.sqrt(10.5) / 2;
+  const d = Math.sqrt(105), fifth = 5 * z * z - 1;
+  return [
+    s * x, s * y, s * z, a * x * y, a * y * z, a * x * z, (a / 2) * (x * x - y * y),
+    (Math.sqrt(5) / 2) * (3 * z * z - 1), b * y * (3 * x * x - y * y), d * x * y * z, c * y * fifth,
+    (Math.sqrt(7) / 2) * z * (5 * z * z - 3), c * x * fifth, (d / 2) * z * (x * x - y * y),
+    b * x * (x * x - 3 * y * y),
+  ];
+}
+// How the network corrects a pose (wildghand/network/heads.py), from the mean of what the geometry
+// branch says at some Gaussians.
+class Refinement {
+  constructor(data, corners, mix) {
+    const { chosen, shares, bounds } = data, places = unpack(data.places, Float32Array);
+    const layers = ["normal", "mix", "first", "last"].map((name) => [name, linear(data[name])]);
+    Object.assign(this, Object.fromEntries(layers), { bounds, light: data.light });
+    this.parts = chosen.map((n, m) => {
+      const share = [mix[2 * n] / 65535, mix[2 * n + 1] / 65535], width = places.length / chosen.length;
+      return {
+        share: shares[m], corners: corners.subarray(3 * n, 3 * n + 3),
+        mix: [...share, 1 - share[0] - share[1]], place: places.subarray(m * width, (m + 1) * width),
+      };
+    });
+  }
+  // 51 steps of pose and translation, from the surface of the hand and its encoded pose.
+  at(surface, posture) {
+    const { light } = this, width = this.parts[0].place.length, mean = new Float64Array(light + width);
+    const hidden = new Float64Array(width), mixed = new Float64Array(width), normal = new Float64Array(3);
+    for (const { share, corners, mix, place } of this.parts) {
+      for (let i = 0; i < 3; i++)
+        normal[i] = mix[0] * surface[8 * corners[0] + 4 + i] + mix[1] * surface[8 * corners[1] + 4 + i]
+          + mix[2] * surface[8 * corners[2] + 4 + i];
+      const length = Math.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2);
+      const basis = harmonics(normal[0] / length, normal[1] / length, normal[2] / length);
+      this.normal(basis, hidden);
+      for (let i = 0; i < width; i++) hidden[i] = silu(hidden[i] + place[i] + posture[i]);
+      this.mix(hidden, mixed);
+      for (let i = 0; i < light; i++) mean[i] += share * basis[i];
+      for (let i = 0; i < width; i++) mean[light + i] += share * silu(mixed[i]);
+    }
+    const { bounds } = this;
+    return this.last(this.first(mean).map(silu)).map((v, i) => bounds[i < 48 ? 0 : 1] * Math.tanh(v));
+  }
 }
 
 // What a network that is too large for the page says: a mean and K components, 15 numbers a Gaussian.
@@ -60,10 +111,10 @@ class Table {
   constructor(data) {
     Object.assign(this, { steps: data.steps, bounds: data.bounds, mean: unpack(data.mean, Float32Array) });
     this.basis = unpack(data.basis, Int8Array);
-    this.regression = unpack(data.regression, Float32Array);
+    this.regression = linear(data.regression);
   }
   at(turns) {
-    const values = this.mean.slice(), found = regress(this.regression, this.steps.length, turns);
+    const values = this.mean.slice(), found = this.regression(turns.flatMap((m) => [...m]));
     found.forEach((value, k) => {
       const c = Math.min(Math.max(value, this.bounds[0][k]), this.bounds[1][k]), b = k * values.length;
       const scaled = this.steps[k].map((step) => step * c);
@@ -83,7 +134,10 @@ class Hand {
     this.bones = unpack(data.bones, Uint8Array);
     this.weights = unpack(data.weights, Float32Array);
     this.faces = unpack(data.faces, Uint32Array);
-    this.steps = data.steps && unpack(data.steps, Float32Array);
+    this.steps = data.steps && linear(data.steps);
+    this.corners = unpack(data.corners, Uint16Array);
+    this.mix = unpack(data.mix, Uint16Array);
+    this.refinement = data.refined && new Refinement(data.refined, this.corners, this.mix);
     this.table = data.table && new Table(data.table);
     this.motion = unpack(data.motion, Float32Array);
     if (data.correctives) {
@@ -136,15 +190,20 @@ class Hand {
       transl: moved.map((v, i) => v + centre[i] - wrist[i]),
     };
   }
-  // Places of the joints and their motions, rest place -> turn * place + shift, as the network
-  // corrects the pose.
-  chain({ vectors, turns: given, transl }) {
-    let local = given;
-    if (this.steps) {
-      const step = regress(this.steps, 51, given);
-      local = vectors.map((v, j) => rotation(v.map((x, i) => x + step[3 * j + i])));
-      transl = transl.map((v, i) => v + step[48 + i]);
-    }
+  // A pose as the network corrects it. surface: 8 floats a vertex, overwritten; posture: the pose as
+  // the network's first layer sees it.
+  refined(pose, surface, posture) {
+    let step = null;
+    if (this.refinement) {
+      this.write(surface, 0, pose);
+      step = this.refinement.at(surface, posture);
+    } else if (this.steps) step = this.steps(pose.turns.flatMap((m) => [...m]));
+    if (!step) return pose;
+    const vectors = pose.vectors.map((v, j) => v.map((x, i) => x + step[3 * j + i]));
+    return { vectors, turns: vectors.map(rotation), transl: pose.transl.map((v, i) => v + step[48 + i]) };
+  }
+  // Places of the joints and their motions, rest place -> turn * place + shift.
+  chain({ turns: local, transl }) {
     const turns = [], places = [], shifts = [];
     for (let j = 0; j < 16; j++) {
       const p = PARENTS[j], rest = this.joints[j];
@@ -156,7 +215,7 @@ class Hand {
       const moved = apply(turns[j], rest);
       shifts.push(places[j].map((v, i) => v + transl[i] - moved[i]));
     }
-    return { local, turns, shifts, places: places.map((p) => p.map((v, i) => v + transl[i])) };
+    return { turns, shifts, places: places.map((p) => p.map((v, i) => v + transl[i])) };
   }
   // Rest places of the vertices, with what the hand model's correctives add.
   shaped(local) {
@@ -172,7 +231,7 @@ class Hand {
   }
   // Write 8 floats a vertex of the surface: its place, 1 unused, its unit normal, 1 unused.
   write(out, first, pose) {
-    const { local, turns, shifts } = this.chain(pose), rest = this.shaped(local), count = rest.length / 3;
+    const { turns, shifts } = this.chain(pose), rest = this.shaped(pose.turns), count = rest.length / 3;
     const start = 8 * first;
     for (let n = 0, o = start; n < count; n++, o += 8) {
       const x = rest[3 * n], y = rest[3 * n + 1], z = rest[3 * n + 2];
