@@ -96,7 +96,7 @@ class LocalEngine(Engine):
 
 
 def ignore_progress(done: int, total: int) -> None:
-    """Be told the steps of a job that nobody watches."""
+    """Ignore the progress of a job that is not shown."""
 
 
 def raise_first(errors: Sequence[HwpError], count: int) -> None:

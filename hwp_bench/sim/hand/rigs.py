@@ -343,7 +343,7 @@ def side_of_name(name: str) -> str | None:
 
 
 def hand_joints(names: list[str], wanted: str, where: str) -> tuple[list[int], str | None]:
-    """Rows in `names` of the hand model's 16 joints, and the side that the names tell, if any."""
+    """Rows in `names` of the hand model's 16 joints, and the side that the names state, if any."""
     best: list[int | None] = [None] * len(WEBXR)
     told: str | None = None
     sides = {side_of_name(name) for name in names}

@@ -311,7 +311,7 @@ class OtherArm:
     seed: Seed = 0
 
     def draw(self, canvas: Canvas) -> None:
-        """Draw the arm of a moment."""
+        """Draw the arm at one moment."""
         color = srgb_to_linear(skin_color(canvas.tone if self.tone is None else self.tone))
         rng = generator(self.seed, "other arm")
         phases = rng.uniform(0.0, 2.0 * np.pi, 3)
