@@ -164,8 +164,7 @@ class FewShown(Component):
             fit.model.keep(best)
 
     def best(self, fit: Fit) -> list[Visibility | ColorChanges]:
-        """The choice that draws validation frames best, without those parts that the model already
-        has.
+        """The choice that draws validation frames best, less what the model already has.
 
         Where nothing is judged, these are the shares of the settings. In each case
         Gaussians that close gaps are spared.

@@ -78,11 +78,11 @@ class WildGHandModel(nn.Module):
 
     Attributes:
         log_gains: (R, 3) log of the gain on the sRGB image of each frame.
-        light: for unknown normals in free poses; None keeps the network's colours. visibility: for
-        free poses; None keeps the learnt Gaussians. clip_poses: corrected poses of the clip; None
-        keeps the given ones. color_changes: of places that few frames have shown, in free poses;
-        None: none. shadows: the hands in the light that casts shadows; None: the network alone says
-        how bright
+        light: for unknown normals in free poses; None keeps the network's colours.
+        visibility: for free poses; None keeps the learnt Gaussians.
+        clip_poses: corrected poses of the clip; None keeps the given ones.
+        color_changes: of places that few frames have shown, in free poses; None: none.
+        shadows: the hands in the light that casts shadows; None: the network alone says how bright
             skin is.
         pose_steps: (S, R, 16, 3) rad, added to the given poses of the hands in order.
         transl_steps: (S, R, 3) m, added to the given translations.

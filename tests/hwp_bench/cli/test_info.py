@@ -30,7 +30,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def offer(monkeypatch: pytest.MonkeyPatch, *cases: Case) -> None:
     """Put cases in the place of those of installed packages."""
     module = types.ModuleType("offered")
-    module.cases = lambda: list(cases)
+    module.cases = lambda: list(cases)  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "offered", module)
     points = [types.SimpleNamespace(name="offered", value="offered:cases")] if cases else []
     monkeypatch.setattr("hwp_bench.stability.metadata.entry_points", lambda group: points)
