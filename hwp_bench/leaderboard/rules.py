@@ -88,7 +88,7 @@ def takes_over(revision: Entry, revised: Entry) -> bool:
 
 
 def source_of(entry: Entry) -> tuple[str, str]:
-    """Return what makes a method of the board: its name, and who stands for it.
+    """Return what identifies a method on the board: its name and its submitter.
 
     The names of methods that ship are the toolkit's own, whoever ran them: see
     `names.check_names`.

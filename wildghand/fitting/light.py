@@ -80,7 +80,7 @@ class Lighting(Component):
             fit.model.keep(found)
 
     def seconds(self, fit: Fit) -> float:
-        """The light of a few frames is fitted to see how long that takes."""
+        """Measure the time by fitting the light of a few frames."""
         if not fit.settings.light.enabled:
             return 0.0
 

@@ -29,7 +29,7 @@ Result = TypeVar("Result")
 
 
 class IterativeFit(Generic[Result]):
-    """A fit as the loop sees it. What it leaves at its default costs nothing.
+    """A fit as the loop sees it. Hooks at their defaults cost nothing.
 
     Attributes:
         device: where its tensors live.

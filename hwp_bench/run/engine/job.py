@@ -78,7 +78,7 @@ class Engine:
         pass
 
     def run(self, jobs: Sequence[Job], on_done: OnDone, on_start: OnStart | None = None) -> None:
-        """Run jobs; each result is in its folder before `on_done` hears of it."""
+        """Run jobs; each result is in its folder before `on_done` is called."""
         raise NotImplementedError
 
 
