@@ -96,7 +96,7 @@ def cut(mesh: RigMesh, height: np.ndarray) -> RigMesh:
 def _split(
     faces: np.ndarray, heights: np.ndarray, sign: np.ndarray, count: int
 ) -> tuple[np.ndarray, dict[tuple[int, int], float]]:
-    """The parts of faces above zero, and the share of the way of new points on crossed edges."""
+    """Cut faces at zero: the parts above, and the fractions of the edges where new points lie."""
     shares: dict[tuple[int, int], float] = {}
     index: dict[tuple[int, int], int] = {}
     parts: list[list[int]] = []
