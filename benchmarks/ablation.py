@@ -228,7 +228,7 @@ def summary(part: Part, effects: Sequence[ScoreEffect]) -> str:
         for item in effects
         if (item.kind, item.scope, item.metric) == (kind, "macro", METRIC)
     ]
-    given = "When the others are in" if kind == "out" else "In the mean of the other in and out"
+    given = "When the others are in" if kind == "out" else "On average over the other in and out"
     return (
         f"**{part.title}** ({part.seconds} a fit): {full:.2f} dB with all components, "
         f"{bare:.2f} dB without them (macro mean). {given}: {'; '.join(told)} dB."

@@ -103,7 +103,7 @@ TARGETS = (
            whole=False),
     Target((_BENCH, "leaderboard", "submit", "results", "-o", OUT, "--entries", "entries"),
            _RESULTS, ("--author", "--link")),
-    Target((_BENCH, "leaderboard", "confirm", "results", "--checked-by", "x",
+    Target((_BENCH, "dev", "leaderboard", "confirm", "results", "--checked-by", "x",
             "--entries", "entries"),
            (*_RESULTS, *_ENTRIES), ("--tolerance", "--entry"), whole=False),
     Target((_BENCH, "challenge", "check", "sealed/publication/public", "revealed.json",

@@ -1,7 +1,7 @@
 """HWP bench: a benchmark for hand avatars learned from perturbed monocular video.
 
 The names below are loaded when they are first used; `import hwp_bench` loads neither numpy nor
-torch. Their threads are told to sleep while they wait. `docs/python.md` shows the names at work.
+torch. Threads are set to sleep while they wait. `docs/python.md` shows the names at work.
 """
 
 from __future__ import annotations

@@ -76,7 +76,7 @@ def evaluate(
             a seed other than 0 behind it.
         preset: preset of the method; the suite's, else `default`, if None.
         settings: settings that override the preset, such as `{"dpd.enabled": False}`.
-        seed: seed of everything random.
+        seed: seed of all random numbers.
         seconds: limit of the fit on the method's clock, s; without `steps` it lifts the preset's
             limit of steps.
         steps: limit of the fit in optimizer steps.

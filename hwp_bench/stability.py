@@ -60,6 +60,8 @@ class Case:
     run: Callable[[Context], Measured]
     #: Implementations that this machine has; one empty name where there is no choice.
     backends: tuple[str, ...] = ("",)
+    #: Whether it is an ordinary case, which takes a moment, and which `hwp-bench info` runs.
+    quick: bool = False
 
 
 class CaseGroup:

@@ -80,7 +80,7 @@ def with_keys(results: Results) -> Results:
 
 
 def check_of(entry: Entry, kind: str = "rescored", verdict: str = "reproduces") -> Check:
-    """A check of an entry, as `leaderboard confirm` would make it."""
+    """A check of an entry, as `dev leaderboard confirm` would make it."""
     second = kind == "re-run"
     return Check(
         entry=entry.name,

@@ -105,7 +105,7 @@ def test_the_site_is_published_and_problems_come_with_facts() -> None:
     for name in ("problem", "result"):
         form = yaml.safe_load((github / "ISSUE_TEMPLATE" / f"{name}.yml").read_text("utf-8"))
         asked = [part["attributes"].get("label", "") for part in form["body"]]
-        assert "Output of `wildghand info`" in asked
+        assert "Output of `hwp-bench info`" in asked
 
 
 def test_citation_and_changelog_name_the_version() -> None:

@@ -69,12 +69,12 @@ def test_a_thief_who_knows_the_way_gets_no_test_frame(
         pytest.skip("no user namespaces on this machine")
     frames = results.captures[0].frames
     assert all("does not exist" in (frame.failure or "") for frame in frames)
-    # The same method without walls does steal: the test can fail.
+    # The same method without a sandbox does steal: the test can fail.
     bare = EvaluationSettings(confinement=Confinement("none"))
     stolen = evaluate(str(method), [capture.root], tmp_path / "bare", bare).captures[0]
     assert stolen.isolation == "processes"
     assert stolen.failed_frames == 0
-    # What was made without walls is no result where they are required.
+    # What was made without a sandbox is no result where one is required.
     strict = EvaluationSettings(confinement=Confinement("required"))
     again = evaluate(str(method), [capture.root], tmp_path / "bare", strict).captures[0]
     assert again.isolation == "namespaces"

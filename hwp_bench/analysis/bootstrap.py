@@ -147,10 +147,9 @@ def _read(value: float, error: float, freedom: float, skew: float, captures: int
 class Blocks:
     """The overlapping blocks of frames of one capture.
 
-    Neighbouring frames of a video say nearly the same, so single frames must not be drawn as if
+    Neighbouring frames of a video are nearly the same, so single frames must not be drawn as if
     they were independent; blocks of about sqrt(F) frames are. Blocks wrap around at the end, so
-    that every frame is in as many as any other (circular block bootstrap, Politis and Romano
-    1992).
+    that every frame is in as many as any other (circular block bootstrap, Politis and Romano 1992).
     """
 
     #: (S, F) mean over the block that starts at each frame, for each seed.
@@ -193,12 +192,12 @@ class Blocks:
 
 
 def _restored(count: int) -> float:
-    """Factor that makes up for the spread that `count` draws from `count` units lose."""
+    """Factor that restores the spread which `count` draws from `count` units lose."""
     return (count / max(count - 1, 1)) ** 0.5
 
 
 def make_blocks(values: np.ndarray) -> Blocks:
-    """Return the blocks of one capture: (S, F) float, one row a seed, frames in order."""
+    """Return the blocks of one capture: (S, F) float, one row per seed, frames in order."""
     frames = values.shape[1]
     length = max(1, round(frames**0.5))
     around = np.concatenate([values, values[:, : length - 1]], axis=1)

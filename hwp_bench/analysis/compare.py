@@ -283,7 +283,7 @@ def rank_methods(
     against every other one, with Bonferroni's adjustment over these pairs: the interval of each
     method holds with 95 %, and so does the claim that the first is the best, although the data
     chose it. (A wrong claim needs that some method beats the truly best one in a test at
-    `ALPHA` / (m - 1); there are m - 1 such tests.) The tie groups speak of all pairs at once and
+    `ALPHA` / (m - 1); there are m - 1 such tests.) The tie groups hold for all pairs at once and
     claim less.
     """
     differences = compare(runs, metric, resamples=resamples, seed=seed, scope=MACRO)
@@ -334,8 +334,8 @@ def turned(estimate: Estimate) -> Estimate:
 def verdict(ranking: Ranking) -> str:
     """Return one sentence: who wins by how much and how surely, or who ties.
 
-    A method wins where it is significantly better than every other one. Otherwise those that the
-    leader cannot be told from are named.
+    A method wins where it is significantly better than every other one. Otherwise the methods that
+    tie with the leader are named.
     """
     first, *rest = ranking.ranks
     facts = metric_facts(ranking.metric)
@@ -419,7 +419,7 @@ def one_capture_notes(found: Sequence[Contrast]) -> list[str]:
 
 
 def standings_table(metric: str, found: Sequence[Standing]) -> Table:
-    """Return one row a method, best first."""
+    """Return one row per method, best first."""
     facts = metric_facts(metric)
     columns: list[Filled] = [
         (Column("Method"), [one.label for one in found]),
@@ -436,7 +436,7 @@ def standings_table(metric: str, found: Sequence[Standing]) -> Table:
 
 
 def differences_table(metric: str, found: Sequence[Difference]) -> Table:
-    """Return one row a pair and scope."""
+    """Return one row per pair and scope."""
     facts = metric_facts(metric)
     columns: list[Filled] = [
         (Column("First"), [item.first for item in found]),

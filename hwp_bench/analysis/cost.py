@@ -282,7 +282,7 @@ def _front_table(front: Sequence[FrontPart], metric: str) -> Table:
 
 
 def machine_notes(results: Sequence[Results]) -> list[str]:
-    """Return the machines, with warnings: several of them, or methods that ran without walls."""
+    """Return the machines, with warnings: several of them, or runs without a sandbox."""
     machines = {
         f"{result.environment.get('processor', 'unknown')}, "
         f"{result.environment.get('cores', '?')} cores"
@@ -311,7 +311,7 @@ def run_seconds(capture: CaptureResult) -> dict[str, float] | None:
 
 
 def seconds_table(runs: Sequence[MethodRuns]) -> Table | None:
-    """Return one row a part of the runs, and their sum; None where nothing is on record."""
+    """Return one row per part of the runs, and their sum; None where nothing is on record."""
     results = [result for run in runs for result in run.seeds.values()]
     every = [run_seconds(capture) for result in results for capture in result.captures]
     known = [parts for parts in every if parts is not None]

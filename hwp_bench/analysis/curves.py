@@ -141,7 +141,7 @@ def mean_curve(label: str, curves: Mapping[str, Sequence[Curve]]) -> MeanCurve |
 
 
 def pareto_front(curves: Sequence[MeanCurve], higher_is_better: bool) -> list[FrontPart]:
-    """Return which method has the best score after which time: the points that nothing dominates.
+    """Return the method with the best score after each time: the points that no other dominates.
 
     A point is on the front when no method has as good a score in less time. A method that has
     ended keeps its score, and so adds nothing to the front any more.

@@ -26,7 +26,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class ItemStatistics:
-    """How one capture tells methods apart in one metric; None where it cannot be told."""
+    """How well one capture separates methods in one metric; None where that is undefined."""
 
     #: Id of the capture.
     capture: str

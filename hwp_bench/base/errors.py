@@ -49,7 +49,7 @@ class HwpError(Exception):
 
 
 def reason_of(error: OSError) -> str:
-    """Return what the system says of a file or folder that it refuses."""
+    """Return the system's reason for refusing a file or folder."""
     if error.strerror:
         return error.strerror
     first = error.args[0] if error.args else ""
@@ -66,7 +66,7 @@ class UsageError(HwpError):
 
 
 class BadInput(HwpError):
-    """A file from outside is missing, damaged or does not say what it must."""
+    """A file from outside is missing, damaged or incomplete."""
 
 
 class BadImage(BadInput):

@@ -100,7 +100,7 @@ def _name_file(temporary: Path, path: Path, overwrite: bool) -> None:
 
 @contextlib.contextmanager
 def disc_errors(where: str | os.PathLike[str]) -> Iterator[None]:
-    """Turn what the system says of a full or closed disc into one error that names the place.
+    """Turn the system's errors of a full or closed disc into one error that names the place.
 
     For work whose finished parts stay, so that the same call continues. Every other `OSError`, such
     as that of a closed pipe, passes.

@@ -188,7 +188,7 @@ class MachineCode:
             trim(code_folder(), _SUFFIX, MAX_CACHE_BYTES)
 
     def _key(self, sig: Any, codegen: Any) -> tuple[str, ...] | None:
-        """All that the machine code depends on; None if that cannot be told."""
+        """All that the machine code depends on; None if it cannot be determined."""
         prefix = self._prefix()
         if prefix is None:
             return None

@@ -147,7 +147,7 @@ class _Unpickler(_Reader):
         self._classes: dict[str, type[StandIn]] = {}
 
     def __getitem__(self, code: int) -> Callable[[Any], None]:
-        """The function that takes the next step, where its objects are in order."""
+        """Return the function of the next step, if its arguments are sound."""
         self._left -= 1
         if self._left < 0:
             raise ValueError(f"more than {self._most:,} steps")
@@ -340,7 +340,7 @@ def _object_reconstructor(made: Any, base: Any, state: Any) -> Any:
 
 
 def _admitted() -> dict[str, Any]:
-    """Functions without state that stand for the names which a pickle may have."""
+    """Stateless functions for the names that a pickle may contain."""
     names: dict[str, Any] = {
         "numpy.ndarray": _ndarray,
         "numpy.dtype": _Dtype,

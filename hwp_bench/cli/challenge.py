@@ -54,7 +54,7 @@ by how many levels).
 """
 
 
-_WORKERS = "processes of each render (default: as many as are worth it)"
+_WORKERS = "processes of each render (default: as many as help)"
 
 
 def _add_make(parser: argparse.ArgumentParser) -> None:

@@ -208,7 +208,7 @@ def _add_get(parser: argparse.ArgumentParser) -> None:
     text = "hwp: only folders whose names begin with this"
     add("--capture", **SEVERAL, metavar="NAME", help=text)
     add("--revision", help="hwp: branch, tag or commit (default: the newest)")
-    text = "real-1: take the videos from here, whatever they are called, not from the network"
+    text = "real-1: take the videos from this folder, by their content, not from the network"
     add("--from", dest="source", type=Path, metavar="FOLDER", help=text)
     add_json(parser, "print what was downloaded as JSON")
 
@@ -267,7 +267,7 @@ def _add_track(parser: argparse.ArgumentParser) -> None:
     parser.description = "Track the hands of a video."
     parser.epilog = _TRACK
     add = parser.add_argument
-    add("video", type=Path, nargs="?", metavar="VIDEO", help="not mirrored")
+    add("video", type=Path, nargs="?", metavar="VIDEO", help="video file, not mirrored")
     out = "file to write (default: VIDEO.npz)"
     add("-o", "--out", type=Path, metavar="NPZ", help=out)
     hands = "most hands in a frame (default: 2)"

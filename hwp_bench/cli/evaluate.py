@@ -69,7 +69,7 @@ def _add_evaluate(parser: argparse.ArgumentParser) -> None:
     text = f"results folder (default runs/METHOD-SUITE, of several runs/field-SUITE; {out})"
     add("-o", "--out", help=text)
     seeds = parser.add_mutually_exclusive_group()
-    seeds.add_argument("--seed", type=int, default=0, help="seed of everything random")
+    seeds.add_argument("--seed", type=int, default=0, help="seed of all random numbers")
     text = "evaluate with the seeds 0 to N - 1 (default: with one seed)"
     seeds.add_argument("--seeds", type=int, default=1, metavar="N", help=text)
     add_json(parser, "print the result file; of several methods or seeds, files and table")
@@ -440,11 +440,11 @@ def _add_error_budget(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _ERROR_BUDGET
     add = parser.add_argument
     add("method", metavar="METHOD_DIR", help=METHOD_HELP)
-    text = "estimates that the truth replaces (default: all that the captures know)"
+    text = "estimates to replace by the truth (default: all that the captures have)"
     add("--truths", nargs="*", metavar="NAME", help=text)
     _add_evaluation(parser)
     add("-o", "--out", help="folder (default runs/error-budget-METHOD-SUITE)")
-    add("--seed", type=int, default=0, help="seed of everything random")
+    add("--seed", type=int, default=0, help="seed of all random numbers")
     add_json(parser, "print the record, budget.json")
 
 

@@ -66,10 +66,10 @@ it: an entry that carries one is left out, and `check` refuses it, until its dig
 names.json, next to the folder of entries. `leaderboard add` lists what it adds.
 """
 _CONFIRM = """examples:
-  hwp-bench leaderboard confirm runs/mine-mini --checked-by maintainers
-  hwp-bench leaderboard confirm runs/field/mini --checked-by maintainers
-  hwp-bench leaderboard confirm runs/second-run --checked-by maintainers --tolerance 0.05
-  hwp-bench leaderboard confirm runs/second --checked-by maintainers --entry mine-mini-0123abcd
+  hwp-bench dev leaderboard confirm runs/mine-mini --checked-by maintainers
+  hwp-bench dev leaderboard confirm runs/field/mini --checked-by maintainers
+  hwp-bench dev leaderboard confirm runs/second-run --checked-by maintainers --tolerance 0.05
+  hwp-bench dev leaderboard confirm runs/second --checked-by maintainers --entry mine-mini-0123abcd
 
 Checks are never removed. Where checks of an entry contradict each other, the one that differs
 counts until a new check overrules it by name (--overrules, --reason).
@@ -156,7 +156,7 @@ def _add_confirm(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("results", nargs="+", metavar="RESULTS", help="results folder with predictions")
     add("--checked-by", required=True, metavar="NAME", help="who checks")
-    add("--entry", metavar="NAME", help="entry, where several fit")
+    add("--entry", metavar="NAME", help="the entry, if several match")
     text = "largest difference of the macro mean of PSNR of a second run (default 0.1)"
     add("--tolerance", type=float, default=0.1, metavar="DB", help=text)
     add("--capture", **SEVERAL, metavar="PATH", help="captures (default: the result's suite)")

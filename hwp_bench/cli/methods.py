@@ -86,7 +86,9 @@ def _add_check(parser: argparse.ArgumentParser) -> None:
     add("--budget", type=float, default=10.0, metavar="SECONDS", help=text)
     text = "further files and folders that the method may read, such as weights"
     add("--expose", **SEVERAL, metavar="PATH", help=text)
-    add("--isolation", choices=("auto", "required", "none"), default="auto", help="as `evaluate`")
+    add(
+        "--isolation", choices=("auto", "required", "none"), default="auto", help="as in `evaluate`"
+    )
     add_json(parser, "print the report as JSON")
 
 

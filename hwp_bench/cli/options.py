@@ -66,7 +66,7 @@ def add_results(parser: argparse.ArgumentParser, nargs: str = "+", more: str = "
 
 
 def add_capture_folders(parser: argparse.ArgumentParser, purpose: str) -> None:
-    """Add `--capture`, for what results do not say of their captures."""
+    """Add `--capture`, for facts about captures that results do not hold."""
     text = f"capture folders, for {purpose} (simulated ones are found in the cache)"
     parser.add_argument("--capture", **SEVERAL, metavar="PATH", help=text)
 

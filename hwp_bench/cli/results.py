@@ -69,7 +69,7 @@ def _add_table(parser: argparse.ArgumentParser) -> None:
     add(
         "--baseline",
         metavar="NAME",
-        help="robustness: method that the gap is counted from; discrimination: the ceiling",
+        help="robustness: method from which the gap is counted; discrimination: the ceiling",
     )
     add_capture_folders(parser, "severities, clean shares, novelty and outlines")
     forms = ("terminal", "md", "tex", "csv", "json")
@@ -127,7 +127,7 @@ def _add_compare(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     text = "metrics to compare (default: the headline metrics that all have)"
     add("--metric", **SEVERAL, metavar="NAME", help=text)
-    add("--resamples", type=int, default=10_000, help="default 10000")
+    add("--resamples", type=int, default=10_000, help="number of resamples (default 10000)")
     add("--seed", type=int, default=0, help="seed of the resampling")
     forms, text = ("terminal", "md", "tex", "csv"), "format of the tables (default terminal)"
     add("--format", choices=forms, default="terminal", help=text)
@@ -259,9 +259,9 @@ def _add_report(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("-o", "--out", required=True, metavar="DIR", help="folder of the page")
     add_capture_folders(parser, "severities")
-    add("--baseline", metavar="NAME", help="method that shares of the gap are counted from")
+    add("--baseline", metavar="NAME", help="method from which shares of the gap are counted")
     text = (
-        "lead to pages of avatars (captures/ID/avatar.html in a results folder); they run "
+        "link to pages of avatars (captures/ID/avatar.html in a results folder); they run "
         "the scripts of whoever made them"
     )
     add("--avatar-pages", action="store_true", help=text)

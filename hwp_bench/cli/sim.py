@@ -61,8 +61,8 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
     add("--suite", choices=SIMULATED_SUITES, help="render a suite")
     _add_extent(parser)
     _add_variation(parser)
-    add("--seed", type=int, help="another seed of everything random")
-    add("--workers", type=int, help="processes of each render (default: as many as are worth it)")
+    add("--seed", type=int, help="another seed of all random numbers")
+    add("--workers", type=int, help="processes of each render (default: as many as help)")
     add("--exr", action="store_true", help="also linear EXR with extra layers")
     text = "without the clip of unseen poses from cameras all around"
     add("--no-free-view", dest="free_view", action="store_false", help=text)

@@ -1,13 +1,19 @@
-"""Contents of the toolkit, and whether it works here: `list`, `stability`, `completion`."""
+"""Contents of the toolkit, and whether it works here: `list`, `info`, `stability`, `completion`."""
 
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Sequence
+from dataclasses import replace
+from importlib import metadata
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hwp_bench.base.console import notice
-from hwp_bench.base.errors import UsageError
+from hwp_bench.base.errors import MissingDependency, UsageError
+from hwp_bench.base.files import cache_root
+from hwp_bench.base.packages import __version__
 from hwp_bench.base.tables import Table, print_table, to_object
 from hwp_bench.cli.options import add_json, named_table, print_json
 from hwp_bench.cli.program import complete
@@ -236,9 +242,105 @@ def _check_backends(cases: list[Case], asked: list[str]) -> None:
             )
 
 
+_INFO = """examples:
+  hwp-bench info
+  hwp-bench info --json
+
+Prints what a report of a problem needs, and draws a small scene with every rasterizer that this
+machine has, next to the float64 reference. Exit status 0: every check holds; 1: one does not.
+"""
+
+
+def _add_info(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = _INFO
+    add_json(parser)
+
+
+def _info(args: argparse.Namespace) -> int:
+    from hwp_bench.results.schema import environment
+    from hwp_bench.run.runner import sandbox_problem
+    from hwp_bench.stability import run_cases
+
+    refused = sandbox_problem()
+    facts = environment()
+    packages = {"hwp-bench": __version__, **facts.pop("packages")}
+    for name in ("code", "caches"):  # of a result
+        del facts[name]
+    folder = cache_root()
+    facts |= {
+        "memory": os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
+        "gpu": _graphics(),
+        "cache": _from_home(folder),
+        "cache_size": sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()),
+        "tracker": _tracker(),
+        "sandbox": "available" if refused is None else f"not available ({refused})",
+    }
+    outcomes = list(run_cases(_quick_cases()))
+    passed = all(one.measured.passed for one in outcomes)
+    if args.json:
+        checks = [
+            {
+                "check": f"{one.case.group}: {one.case.name}",
+                "backend": one.backend,
+                "must_hold": one.case.must_hold,
+                "measured": one.measured.text,
+                "passed": one.measured.passed,
+            }
+            for one in outcomes
+        ]
+        print_json({**facts, "packages": packages, "checks": checks})
+        return 0 if passed else 1
+    for name in ("memory", "cache_size"):
+        facts[name] = f"{facts[name] / 2**30:.1f} GiB"
+    rows = [(name.replace("_", " "), value or "-") for name, value in facts.items()]
+    rows += packages.items()
+    for one in outcomes:
+        state = "right" if one.measured.passed else f"WRONG, must be: {one.case.must_hold}"
+        rows.append((f"{one.case.group} ({one.backend})", f"{state}; {one.measured.text}"))
+    for name, value in rows:
+        print(f"{name:<31} {value}")
+    return 0 if passed else 1
+
+
+def _graphics() -> str:
+    import torch
+
+    return ", ".join(map(torch.cuda.get_device_name, range(torch.cuda.device_count()))) or "none"
+
+
+def _from_home(path: Path) -> str:
+    """Return a path that does not say who the user is."""
+    home = Path.home()
+    return f"~/{path.relative_to(home)}" if path.is_relative_to(home) else str(path)
+
+
+def _tracker() -> str:
+    from hwp_bench.tracking.networks import HAND, PALM, models_folder
+
+    there = all((models_folder() / name).is_file() for name in (PALM, HAND))
+    networks = "networks are in the cache" if there else "networks are downloaded on first use"
+    try:
+        return f"ai-edge-litert {metadata.version('ai-edge-litert')}, {networks}"
+    except metadata.PackageNotFoundError:
+        return f"not installed (extra track); {networks}"
+
+
+def _quick_cases() -> list[Case]:
+    from hwp_bench.stability import find_cases
+
+    try:
+        cases = [case for case in find_cases() if case.quick]
+    except MissingDependency:  # the toolkit alone, without a package that draws
+        return []
+    # The reference is what the others are compared with.
+    others = [tuple(name for name in case.backends if name != "reference") for case in cases]
+    return [replace(case, backends=names) for case, names in zip(cases, others, strict=True)]
+
+
 #: The arguments and the work of each command, where `main` looks for them.
 COMMANDS = {
     "list": (_add_list, _list),
+    "info": (_add_info, _info),
     "stability": (_add_stability, _stability),
     "completion": complete("hwp-bench", "hwp_bench.cli"),
 }

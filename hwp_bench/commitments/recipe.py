@@ -1,7 +1,7 @@
 """The recipe of a sealed suite: public scenes, and a secret that exchanges seeds and people.
 
-Every number is HMAC-SHA256 under the secret, of a label that says what the number is for. So none
-tells anything of another one or of the secret (RFC 2104; as the expand step of HKDF, RFC 5869).
+Every number is HMAC-SHA256 under the secret, of a label that says what the number is for. So no
+number reveals another one or the secret (RFC 2104; as the expand step of HKDF, RFC 5869).
 """
 
 from __future__ import annotations
@@ -67,8 +67,8 @@ def derived(secret: str, *purpose: str) -> bytes:
 def derived_seed(secret: str, *purpose: str) -> int:
     """Return the seed of 63 bits that a secret gives for one purpose.
 
-    With fewer bits all seeds could be tried: a person's shape, which methods are told, follows
-    from one of them in microseconds.
+    With fewer bits all seeds could be tried: a person's shape, which methods get, follows from one
+    of them in microseconds.
     """
     return int.from_bytes(derived(secret, "seed", *purpose)[:8], "big") & MAX_SEED
 
@@ -76,7 +76,7 @@ def derived_seed(secret: str, *purpose: str) -> int:
 def secret_commitment(secret: str, recipe: Mapping[str, Any]) -> str:
     """Return the SHA-256 (hex) that binds an organiser to a secret and a recipe.
 
-    The secret has 256 random bits, so that the digest tells nothing of it.
+    The secret has 256 random bits, so the digest reveals nothing about it.
     """
     text = canonical_json({"schema": SECRET_SCHEMA, "secret": secret, "recipe": dict(recipe)})
     return hashlib.sha256(text.encode()).hexdigest()

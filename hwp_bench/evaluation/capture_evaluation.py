@@ -320,7 +320,7 @@ def _refuse_changed(evaluation: CaptureEvaluation) -> None:
 def stored_result(evaluation: CaptureEvaluation, folder: Path) -> CaptureResult | None:
     """Return the stored result of the same key, if there is one and the method did not fail.
 
-    Where walls are required, a result that was made without them does not count.
+    Where a sandbox is required, a result that was made without one does not count.
     """
     # Submitted predictions may change without their method.toml, so they are always scored.
     if not (folder / RESULT).is_file() or evaluation.manifest.kind == "predictions":

@@ -1,7 +1,7 @@
 """Recompute the digests and scores of a result from its stored predictions.
 
-PSNR and SSIM of some frames are computed a second time, by scikit-image. What no pixel decides
-(labels, keys, stored copies, tables) is compared with what binds it.
+PSNR and SSIM of some frames are computed a second time, by scikit-image. Labels, keys, stored
+copies and tables, on which no pixel depends, are compared with their digests.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ _SHOWN = 100
 
 @dataclass(frozen=True)
 class Discrepancy:
-    """One part of a result that is not as the result says."""
+    """One part of a result that differs from what was recomputed."""
 
     #: Id of the capture; empty for the whole result.
     capture: str

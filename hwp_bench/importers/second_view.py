@@ -80,7 +80,7 @@ def read_calibration(path: Path) -> TwoCameras:
 
 @dataclass(frozen=True)
 class SecondView:
-    """What became of a second camera."""
+    """The outcome of importing a second camera."""
 
     #: Frames of the clip: their numbers in the capture, and in that of the second camera.
     frames: list[int]
@@ -249,8 +249,8 @@ def _join(
     """Find the scale of a capture, and move its hands to where both cameras see them.
 
     Least squares over the scale and one shift a hand and frame, of the landmarks' distances in
-    both images. A picture alone does not tell a small hand from one that is far away, so that
-    an import is right but for a scale, and errs most along the ray.
+    both images. One picture cannot distinguish a small hand from a distant one. So an import is
+    right except for its scale, and its error is largest along the ray.
 
     Args:
         hands: of the first capture, in its world; `points` (F, P, 3) m are their landmarks.

@@ -48,7 +48,7 @@ _Rows = Annotated[
 
 @dataclass(frozen=True)
 class _Frame:
-    """A frame, with what the top of the file says of all frames."""
+    """A frame, with the fields that the file states for all frames."""
 
     file_path: Line
     mask_path: Line

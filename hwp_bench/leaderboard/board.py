@@ -118,7 +118,7 @@ class BoardRow:
 
     @property
     def fit_seconds(self) -> float | None:
-        """Mean seconds of a fit over captures and seeds; None where the method says none."""
+        """Mean seconds of a fit over captures and seeds; None where the method reports none."""
         return _mean([capture.fit_seconds for capture in self.captures])
 
     @property
@@ -133,7 +133,7 @@ class BoardRow:
 
     @property
     def badge(self) -> str:
-        """The least that the badge of one of its entries says, one of `BADGES`."""
+        """The weakest badge of its entries, one of `BADGES`."""
         return min((entry.badge for entry in self.entries), key=_LEAST.index)
 
     def why_older(self, entry: Entry) -> str:
@@ -198,7 +198,7 @@ def _older(row: BoardRow, own: Iterable[Entry]) -> tuple[Entry, ...]:
 
 
 def _labels(rows: Sequence[BoardRow]) -> list[str]:
-    """Titles, with the submitter and at last the entry where they do not tell rows apart."""
+    """Titles, with the submitter, and then the entry, where titles are not unique."""
     stages = [
         [row.title for row in rows],
         [

@@ -79,7 +79,7 @@ class Submission:
 
 @dataclass(frozen=True)
 class Check:
-    """One check of an entry, made by `hwp-bench leaderboard confirm`."""
+    """One check of an entry, made by `hwp-bench dev leaderboard confirm`."""
 
     #: Name of the entry.
     entry: Line
@@ -176,7 +176,7 @@ class Contest:
 
     @property
     def kind(self) -> str:
-        """What its file is called after."""
+        """Kind of record, from which its file is named."""
         return "contest" if self.withdraws is None else "withdrawal"
 
 
@@ -474,7 +474,7 @@ def _read_check(file: Path) -> Check:
     value = without_schema(read_json(file), CHECK_SCHEMA, where=file)
     content = parse_record(_CheckFile, value, where=file)
     if content.digest != sha256_json(value["check"]):
-        raise _changed(file, "check", "Check again with `hwp-bench leaderboard confirm`.")
+        raise _changed(file, "check", "Check again with `hwp-bench dev leaderboard confirm`.")
     return content.check
 
 

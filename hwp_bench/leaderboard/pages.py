@@ -129,7 +129,7 @@ def verdict_of(lead: Estimate | None) -> str | None:
     """Say what an interval of `OURS` less another method shows."""
     if lead is None or lead.low is None or lead.high is None:
         return None
-    return "ahead" if lead.low > 0 else "behind" if lead.high < 0 else "not told apart"
+    return "ahead" if lead.low > 0 else "behind" if lead.high < 0 else "not significant"
 
 
 # --- the blocks: a line a suite, and a section a suite
@@ -178,7 +178,7 @@ def _completeness(one: Field) -> str:
     missing = [title for name, title in titles.items() if name not in one.named]
     told = f"{len(titles) - len(missing)} of the {len(titles)} methods that ship are complete here."
     if missing:
-        told += f" **A part of the field**: no complete run of {', '.join(missing)}."
+        told += f" **Incomplete**: no complete run of {', '.join(missing)}."
     return told
 
 

@@ -1,6 +1,6 @@
 """The rules of the leaderboard: which entries fit, share a table, carry which name, and are sound.
 
-An entry has no pixels, so that its scores are compared by `hwp-bench leaderboard confirm`. All else
+An entry has no pixels, so `hwp-bench dev leaderboard confirm` compares its scores. All else
 that moves a number, a label or a rank is bound here: to the suite, to the key that the evaluation
 left, or to other fields.
 """
@@ -88,7 +88,7 @@ def takes_over(revision: Entry, revised: Entry) -> bool:
 
 
 def source_of(entry: Entry) -> tuple[str, str]:
-    """Return what makes a method of the board: its name, and who stands for it.
+    """Return what identifies a method on the board: its name and its submitter.
 
     The names of methods that ship are the toolkit's own, whoever ran them: see
     `names.check_names`.
@@ -599,7 +599,7 @@ def check_source(file: Path) -> None:
 
 
 def sound_entries(folder: Path) -> list[Entry]:
-    """Read the entries of a folder that are sound; what is not is left out and said.
+    """Read the sound entries of a folder; others are left out and named.
 
     A false entry blocks no other one: it is left out alone, with those that revise it.
     `hwp-bench leaderboard check` refuses it.

@@ -240,7 +240,7 @@ def _first_seeds(rows: Sequence[BoardRow], folders: Collection[str]) -> list[Ent
 
 
 def _titles(entries: Sequence[Entry]) -> dict[str, str]:
-    """How entries are called in lists: by method, with what tells two of one title apart."""
+    """Names of entries in lists: the method's title, and more where two share a title."""
     names: dict[str, str] = {}
     for suite in {entry.results.suite for entry in entries}:
         rows = [entry for entry in entries if entry.results.suite == suite]

@@ -179,7 +179,7 @@ def pull_request_text(made: Iterable[tuple[Entry, int]]) -> str:
         "",
         "```sh",
         f"hwp-bench leaderboard check --entries {PLACE} --against BASE/{PLACE}",
-        f"hwp-bench leaderboard confirm RESULTS --entries {PLACE} --checked-by NAME",
+        f"hwp-bench dev leaderboard confirm RESULTS --entries {PLACE} --checked-by NAME",
         "```",
     ]
     return "\n".join(lines) + "\n"

@@ -200,7 +200,7 @@ def write_suite_data(path: Path, data: SuiteData) -> Path:
 
 
 def _without_empty(value: Any) -> Any:
-    """The record without optional fields that say nothing."""
+    """The record without empty optional fields."""
     if isinstance(value, dict):
         return {
             key: _without_empty(item)

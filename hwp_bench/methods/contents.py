@@ -14,7 +14,7 @@ from hwp_bench.base.files import sha256_of
 from hwp_bench.base.folders import LOCK
 
 #: Folders that do not count, at any depth: what version control, Python and editors make again.
-#: A method behind walls finds them empty, so that nothing that decides a score can lie there.
+#: A method in a sandbox finds them empty, so that nothing that decides a score can lie there.
 LEFT_OUT = frozenset(
     {"__pycache__", ".git", ".hg", ".svn", ".idea", ".vscode", ".ipynb_checkpoints"}
     | {".mypy_cache", ".ruff_cache", ".pytest_cache"}
@@ -66,11 +66,11 @@ def exposed_digest(paths: Iterable[Path]) -> str:
 
 
 def unseen_folders(root: Path, *, ships: bool = False) -> list[Path]:
-    """Return the folders below a method's that it finds empty inside the walls.
+    """Return the folders below a method's that it finds empty inside the sandbox.
 
     Captures and outputs of runs, which hold true frames (`is_foreign`), and what is in no digest
     (`LEFT_OUT`). The latter stays in a method that ships, and in an environment of Python: what is
-    compiled there belongs to packages. Links are not followed; inside walls they lead nowhere.
+    compiled there belongs to packages. Links are not followed; inside they lead nowhere.
     """
     found: list[Path] = []
     waiting, seen = [(root, not ships)], 0
@@ -100,7 +100,7 @@ def is_foreign(folder: str | os.PathLike[str], names: Collection[str]) -> bool:
     """Return whether a folder below a method's is a capture or an output of a run.
 
     A capture and a results file are known by what they begin with, an output that is not finished
-    by its lock file or its temporary name. A method behind walls finds such folders empty.
+    by its lock file or its temporary name. A method in a sandbox finds such folders empty.
     """
     if _TEMPORARY.fullmatch(os.path.basename(folder)) or LOCK in names:
         return True

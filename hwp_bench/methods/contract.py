@@ -141,7 +141,7 @@ class RunSettings:
 
     #: Settings of the method: the preset's table with overrides.
     settings: Mapping[str, Any] = field(default_factory=dict)
-    #: Seed of everything random.
+    #: Seed of all random numbers.
     seed: int = 0
     #: When to stop fitting.
     budget: Budget = field(default_factory=Budget)

@@ -152,7 +152,7 @@ class Base:
 
 @dataclass(frozen=True)
 class ManifestFields:
-    """The fields of a `method.toml`, but for its schema; what is empty the file does not say."""
+    """The fields of a `method.toml` except its schema; empty ones are absent from the file."""
 
     #: Short name: letters, digits, `.`, `_`, `-`.
     name: _MethodName

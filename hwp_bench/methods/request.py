@@ -206,7 +206,7 @@ def _replaced_by(choice: str) -> list[str]:
 
 
 def _with_truths(capture: Capture, split: Split, names: list[str]) -> TrainingInputs:
-    """The capture as it is, but for some estimates."""
+    """The capture with some estimates replaced by the truth."""
     known = known_oracle_inputs(capture)
     for name in names:
         if name not in ORACLE_INPUTS:

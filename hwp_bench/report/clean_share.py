@@ -125,7 +125,7 @@ def scores_by_share(
 
 
 def _of_its_captures(result: Results) -> Results:
-    """A result under its captures' digests in place of a suite: captures of none share a name."""
+    """A result whose captures are named by their digests, because their names are not unique."""
     digests = sorted(capture.digest for capture in result.captures)
     return replace(result, suite=" ".join(digests))
 
@@ -143,7 +143,7 @@ def _behind(
 def clean_share_table(
     results: Sequence[Results], captures: Mapping[str, CaptureInfo], metric: str = HEADLINE[0]
 ) -> Table:
-    """Return one row a share and method: score and difference from the first, with intervals."""
+    """Return one row per share and method: score and difference from the first, with intervals."""
     found = scores_by_share(results, captures, metric)
     digits = metric_facts(metric).digits
     score = score_column(metric)

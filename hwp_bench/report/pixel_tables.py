@@ -175,7 +175,7 @@ def spread_outwards(prediction: np.ndarray, lit: np.ndarray) -> np.ndarray:
 
 
 def _untouched(mask: np.ndarray, *, coverage: bool) -> np.ndarray:
-    """(H, W) bool: pixels of which the hand covers nothing."""
+    """(H, W) bool: pixels that the hand does not touch."""
     if coverage and mask.dtype != np.bool_:
         return mask == 0
     near = cv2.dilate(hand_pixels(mask).astype(np.uint8), _RIM, iterations=UNCERTAIN)
@@ -197,7 +197,7 @@ CLASSES = (
 
 
 def novelty_table(sources: Sequence[ResultsSource], captures: Mapping[str, Capture]) -> Table:
-    """Return one row a class of novelty and method: share of the pixels and of the error, PSNR.
+    """Return one row per class of novelty and method: share of the pixels and of the error, PSNR.
 
     Errors are pooled over the scored pixels of all frames of all captures. Frames without a
     sound prediction are left out.
@@ -304,7 +304,7 @@ _NOTES = (
 
 
 def outline_table(sources: Sequence[ResultsSource], captures: Mapping[str, Capture]) -> Table:
-    """Return one row a method: PSNR, what is drawn outside, and PSNR with it and with more of it.
+    """Return one row per method: PSNR, what is drawn outside, and PSNR with it and with more of it.
 
     Frames without a sound prediction are left out, and captures that are not at hand for every
     method.

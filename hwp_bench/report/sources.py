@@ -169,7 +169,7 @@ def open_captures_of(
 def _located(
     results: Iterable[Results], folders: Sequence[str | os.PathLike[str]]
 ) -> dict[str, tuple[CaptureInfo, Path]]:
-    """The captures' own descriptions and their places, by digest."""
+    """The descriptions and folders of the captures, by digest."""
     digests = {c.digest: c.id for result in results for c in result.captures}
     places = [Path(folder) for folder in folders]
     caches = [cache_root() / kind / "captures" for kind in ("sim", "real")]

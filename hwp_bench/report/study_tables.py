@@ -33,7 +33,7 @@ METRIC = HEADLINE[0]
 
 
 def rank_table(runs: Sequence[MethodRuns]) -> Table:
-    """Return one row a method, best first: rank with interval, score, what it is behind, ties."""
+    """Return one row per method, best first: rank, score, distance from the first, ties."""
     ranking = rank_methods(runs, METRIC)
     facts = metric_facts(METRIC)
     others = [name for name in common_metrics(runs, HEADLINE) if name != METRIC]
@@ -75,7 +75,7 @@ def winner_note(results: Sequence[Results]) -> str | None:
 
 
 def cost_table(runs: Sequence[MethodRuns]) -> Table:
-    """Return one row a method: its score, the score after fixed times, seconds and memory."""
+    """Return one row per method: its score, the score after fixed times, seconds and memory."""
     facts = metric_facts(METRIC)
     costs = method_costs(runs, METRIC, budgets=BUDGETS)
     scores = [macro_mean(run, METRIC) for run in runs]
@@ -126,7 +126,7 @@ LEVELS = ((1.0, "Low"), (2.0, "Medium"), (5.1, "High"))
 
 
 def robustness_table(sources: Sequence[ResultsSource], base: str | None = None) -> Table:
-    """Return what perturbed frames cost each method, and how much of that it wins back."""
+    """Return the loss of each method by perturbed frames, and the share of it that it recovers."""
     runs = group_runs([source.results for source in sources])
     perturbed = [run for run in runs if run.first.frames == "perturbed"]
     pairs = [(run, clean) for run in perturbed if (clean := _oracle(run, runs)) is not None]
@@ -196,7 +196,7 @@ def _closed(base: float | None, score: float, oracle: float, *, higher: bool) ->
 
 
 def severity_table(sources: Sequence[ResultsSource], captures: Mapping[str, CaptureInfo]) -> Table:
-    """Return one row a perturbation, level of severity and method."""
+    """Return one row per perturbation, severity level and method."""
     results = [source.results for source in sources]
     names = [name for name in HEADLINE[:3] if all(name in r.metrics for r in results)]
     cells: dict[tuple[int, int], dict[int, list[list[float]]]] = {}
@@ -273,7 +273,7 @@ def _level(severity: float | None) -> str | None:
 
 
 def bias_table(sources: Sequence[ResultsSource], captures: Mapping[str, CaptureInfo]) -> Table:
-    """Return the mean temporal weight against the perturbation level, a row a capture."""
+    """Return the mean temporal weight against the perturbation level, a row per capture."""
     names = [name for name in HEADLINE if all(name in s.results.metrics for s in sources)]
     rows = bias_rows(sources, captures, names)
     if not rows:
@@ -308,7 +308,7 @@ def refused_bias() -> UsageError:
 
 
 def seeds_table(sources: Sequence[ResultsSource]) -> Table:
-    """Return one row a method: mean and standard deviation over seeds of the macro mean."""
+    """Return one row per method: mean and standard deviation over seeds of the macro mean."""
     runs = group_runs([source.results for source in sources])
     names = common_metrics(runs, HEADLINE)
     columns: list[Filled] = [
@@ -331,7 +331,7 @@ def seeds_table(sources: Sequence[ResultsSource]) -> Table:
 
 
 def discrimination_table(runs: Sequence[MethodRuns], base: str | None = None) -> Table:
-    """Return one row a metric and capture: how far it tells methods apart, the best capture first.
+    """Return one row per metric and capture: how well it separates methods, best first.
 
     `base` names a method whose scores are the ceiling, such as the truth as an entry; otherwise the
     ceiling is the score of identical images.

@@ -63,7 +63,7 @@ def all_tables(results: Sequence[Results]) -> dict[str, Table]:
 def overall_table(
     results: Sequence[Results], groups: Mapping[str, Sequence[Scores]], metrics: Sequence[str]
 ) -> Table:
-    """Return one row a method: means, and what they cost."""
+    """Return one row per method: means, and what they cost."""
     table = mean_table(results, groups, metrics)
     costs: list[Filled] = [
         (Column("Fit [s]", 1, group="Cost"), [_fit_seconds(result) for result in results]),
@@ -85,7 +85,7 @@ def mean_table(
     metrics: Sequence[str],
     note: str = "",
 ) -> Table:
-    """Return one row a method: means of `metrics` in each group of columns."""
+    """Return one row per method: means of `metrics` in each group of columns."""
     names = _present(results, metrics)
     columns: list[Filled] = [(Column("Method"), labels(results))]
     columns += [
@@ -113,7 +113,7 @@ def _groups(means: Sequence[Aggregate]) -> dict[str, list[Scores]]:
 
 
 def capture_table(results: Sequence[Results], means: Sequence[Aggregate]) -> Table:
-    """Return one row a method and capture."""
+    """Return one row per method and capture."""
     names = _present(results, HEADLINE)
     ids = dict.fromkeys(capture.id for result in results for capture in result.captures)
     shown = [
@@ -143,7 +143,7 @@ def capture_table(results: Sequence[Results], means: Sequence[Aggregate]) -> Tab
 
 
 def perturbation_table(results: Sequence[Results], means: Sequence[Aggregate]) -> Table:
-    """Return one row a method, one group of columns a perturbation, as the paper's table."""
+    """Return one row per method, with a group of columns per perturbation, as in the paper."""
     names = _present(results, HEADLINE[:3])
     present = [p for p in PERTURBATIONS if any(p in mean.overall.perturbations for mean in means)]
     columns: list[Filled] = [(Column("Method"), labels(results))]
@@ -324,7 +324,7 @@ def free_view_tables(results: Sequence[Results]) -> dict[str, Table]:
 
 
 def free_view_table(results: Sequence[Results]) -> Table:
-    """Return one row a capture and method, and one a method over all captures.
+    """Return one row per capture and method, and one per method over all captures.
 
     Seeds of a method are averaged. Failed frames are counted where there are any. `all` is the
     mean over the captures that every method has scores of, each of which counts the same.

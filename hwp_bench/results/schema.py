@@ -52,7 +52,7 @@ Limits = dict[_Limit, Count | Seconds | None]
 FreeTable = dict[Line, Any]
 # Longest text of a setting's value.
 _SHOWN = 40
-#: What `CaptureResult.isolation` says of a run inside the walls.
+#: What `CaptureResult.isolation` says of a run inside the sandbox.
 ISOLATED = "namespaces"
 #: What `Results.environment` says under `caches`: a run finds nothing that a method wrote before.
 NEW_CACHES = "new for each run"
@@ -251,7 +251,7 @@ class Results:
     method: MethodId
     #: Name of the suite, or `captures` when captures were named one by one.
     suite: Line
-    #: Seed of everything random.
+    #: Seed of all random numbers.
     seed: Seed
     #: Limits of the fit: `seconds`, `steps`, either may be None.
     budget: Limits
@@ -400,7 +400,7 @@ def differing_settings(results: Sequence[Results]) -> list[str]:
 
 
 def unisolated_captures(results: Results) -> dict[str, list[str]]:
-    """Return the ids of the captures that a method ran on without walls, by the reason.
+    """Return the ids of the captures that a method ran on without a sandbox, by the reason.
 
     The reason is empty where a person asked for none. Predictions that came as files, and results
     of versions that recorded nothing, are left out.
@@ -426,15 +426,15 @@ def isolation_text(results: Results, head: str = "") -> str:
     return (
         f"warning: {head}no isolation on {'; '.join(parts)}. The method could read every file that "
         "its user can read, test frames among them, and use the network. --isolation required "
-        "refuses to run without walls."
+        "refuses to run without a sandbox."
     )
 
 
 def isolation_note(results: Sequence[Results]) -> str:
-    """Return a line under a table that names methods which ran without walls; empty if none did."""
+    """Return a line for a table, naming methods that ran without a sandbox; empty if none."""
     titles = [one.method.title for one in results if unisolated_captures(one)]
     names = ", ".join(dict.fromkeys(titles))
-    return f"Run without walls, where test frames can be read: {names}." if names else ""
+    return f"Run without a sandbox, where test frames can be read: {names}." if names else ""
 
 
 def add_isolation_note(table: Table, results: Sequence[Results]) -> Table:
@@ -465,9 +465,9 @@ def add_validation_note(table: Table, results: Sequence[Results]) -> Table:
 def environment() -> dict[str, Any]:
     """Return the versions, the processor and the system; no host name and no path.
 
-    `code` is the digest of the toolkit's own modules, which a version number alone does not tell
-    while it is being developed, and `commit` that of a checkout. `caches` says what caches the
-    methods began with.
+    `code` is the digest of the toolkit's own modules, because a version number does not identify
+    code under development, and `commit` that of a checkout. `caches` says what caches the methods
+    began with.
     """
     versions = {}
     for package in PACKAGES:

@@ -16,8 +16,7 @@ def start() -> int:
     """Run the `main` of the module that the first argument names; returns the exit status.
 
     Denormals are flushed before the module is imported, so that the threads which its imports
-    start (those of NumPy's BLAS are the first) flush them too. How many those are is said before
-    as well.
+    start (those of NumPy's BLAS are the first) flush them too. Their number is set before, too.
     """
     from hwp_bench.base.numerics import flushed_process, share_processors
 

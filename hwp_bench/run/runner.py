@@ -8,6 +8,7 @@ import re
 import shutil
 import signal
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -234,6 +235,22 @@ def _run(
     return outcome, isolation
 
 
+def sandbox_problem() -> str | None:
+    """Return why a method would run here without a sandbox, or None."""
+    with tempfile.TemporaryDirectory() as folder:
+        output = Path(folder)
+        environment, places = sandbox_environment(output, output, output, Confinement())
+        program = Program(
+            [sys.executable, "-c", ""],
+            output,
+            environment,
+            places,
+            output / LOG,
+            has_accelerators(),
+        )
+        return run_confined(program, Limits(60.0, Confinement().memory_bytes)).refused
+
+
 def _command(manifest: MethodManifest, request: Path, output: Path) -> list[str]:
     places = {
         "request": str(request.resolve()),
@@ -341,7 +358,7 @@ class SpaceWatch:
         return None
 
     def _refusal(self) -> str | None:
-        """Why nothing can be written now, where free bytes do not tell it: quotas, inodes."""
+        """Why nothing can be written now although bytes are free: quotas, inodes."""
         probe = temporary_name(self._folder / "probe")
         try:
             probe.write_bytes(bytes(_PROBE))

@@ -144,7 +144,7 @@ def run(training: TrainingCapture, factory: MethodFactory, output: Path, draw: D
     entered = time.perf_counter()
     method = factory(training.run.settings, training.run.seed)
     ready_seconds = time.perf_counter() - entered
-    notice(f"Made ready in {ready_seconds:.1f} s, which the seconds of the fit leave out.")
+    notice(f"Ready after {ready_seconds:.1f} s, which do not count as seconds of the fit.")
     report = ReportClock(training.run.budget, record, output / PROGRESS)
     avatar = method.fit(training, training.run.budget, report)
     fit_seconds, cpu = report.elapsed, report.cpu_seconds
@@ -384,7 +384,7 @@ class Checkpoint:
 
 @dataclass(frozen=True)
 class RunFacts:
-    """Time, steps and memory of a run; None where the method does not say."""
+    """Time, steps and memory of a run; None where the method reports none."""
 
     #: Seconds on the method's clock.
     fit_seconds: Seconds | None = None

@@ -25,7 +25,7 @@ class SuiteCapture(Protocol):
 
     @property
     def shows(self) -> str:
-        """One line for people that says what it shows."""
+        """One line that describes it."""
 
     @property
     def hands(self) -> str:

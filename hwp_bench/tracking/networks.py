@@ -1,4 +1,4 @@
-"""The two networks of MediaPipe for hands: their files, what they are given, and what they say.
+"""The two networks of MediaPipe for hands: their files, inputs and outputs.
 
 They are those of MediaPipe 0.10.21 (Apache License 2.0), the last release that contains its
 networks: read from the cache, from a file that a person gives, or downloaded once. Its wheel is
@@ -289,7 +289,7 @@ class SeenHand:
         return float(np.ptp(self.image[:, :2], axis=0).max())
 
     def place_in(self, region: Region) -> SeenHand:
-        """Put what the network says of a region, a square, into the image.
+        """Move the network's output for a region, a square, into the image.
 
         The network's points are px of its own image, and its axes those of the region.
         """

@@ -139,7 +139,7 @@ class HandTracker:
 
 
 def _without_doubles(seen: list[tuple[TrackedHand, float]]) -> list[TrackedHand]:
-    """Hands without those that are another hand again; what moved least comes first and is kept."""
+    """Leave out hands that repeat another one; the one that moved least is kept."""
     kept: list[TrackedHand] = []
     for hand, _ in sorted(seen, key=lambda pair: pair[1]):
         size = hand.hand.size()

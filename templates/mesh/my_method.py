@@ -9,7 +9,7 @@ class MyMethod:
     """Gives each vertex the mean colour of the pixels that show it."""
 
     def __init__(self, settings, seed):
-        """Take the settings of the preset in method.toml, and the seed of everything random."""
+        """Take the settings of the preset in method.toml, and the seed of all random numbers."""
 
     def fit(self, training, budget, report):
         """Return the avatar; `training` is a hwp_bench.methods.TrainingCapture."""

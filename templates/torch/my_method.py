@@ -13,7 +13,7 @@ class MyMethod:
     """Fits the colours of the vertices by Adam."""
 
     def __init__(self, settings, seed):
-        """Take the settings of the preset in method.toml, and the seed of everything random."""
+        """Take the settings of the preset in method.toml, and the seed of all random numbers."""
         self.steps, self.rate = settings["steps"], settings["rate"]
         self.random = np.random.default_rng(seed)
 

@@ -238,7 +238,7 @@ class WildGHandAvatar(HandAvatar):
 
     @functools.cached_property
     def studio(self) -> Studio:
-        """Where the hands and a camera stand when nobody says where."""
+        """The default places of the hands and a camera."""
         templates = {side: rig.template for side, rig in self.model.rigs.items()}
         return Studio(self.hand_model.source, templates, self.betas)
 
@@ -309,11 +309,11 @@ class WildGHandAvatar(HandAvatar):
         return self.pose(self.rest_poses())
 
     def posed(self, hands: Mapping[str, HandPose]) -> PosedHands:
-        """Return the hands as tensors; one in a pose of the clip in that which the fit believes."""
+        """Return the hands as tensors; a pose of the clip is replaced by the corrected one."""
         return super().posed(self.believed(hands))
 
     def believed(self, hands: Mapping[str, HandPose]) -> dict[str, HandPose]:
-        """The hands; one in a pose that the clip gave is in the pose that the fit believes in.
+        """The hands; a pose of the clip is replaced by the fit's corrected one.
 
         `render` and `pose` do this by themselves.
         """
@@ -345,7 +345,7 @@ class WildGHandAvatar(HandAvatar):
 
         Args:
             hands: by side.
-            closed: after them, the walls that close the open ends of the wrists in `render`.
+            closed: add the caps that close the open ends of the wrists in `render`.
             viewmat: (4, 4) world to camera, m: colours are those that `render` draws for this
                 camera. None: those that the network gives, also where no frame has shown them.
 

@@ -1,4 +1,4 @@
-"""Poses as named angles, and where an avatar stands when nobody says where.
+"""Poses as named angles, and the default place of an avatar.
 
 It stands upright, in front of a camera that sees all of it. The hand turns, and not the camera,
 because what a clip taught of its light holds in front of its camera: so every side is shown in a

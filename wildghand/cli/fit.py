@@ -61,7 +61,7 @@ GPU of its own.
 def _add_fit(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _FIT_EXAMPLES
     add = parser.add_argument
-    add("source", type=Path, metavar="VIDEO|CAPTURE", help="what to fit")
+    add("source", type=Path, metavar="VIDEO|CAPTURE", help="capture folder or video file")
     out = "avatar folder to make (default for a video: VIDEO_avatar)"
     add("-o", "--out", type=Path, help=out)
     quick = "a third of the time: fewer frames, Gaussians, steps"
@@ -79,7 +79,7 @@ def _add_fit(parser: argparse.ArgumentParser) -> None:
     add("--all-frames", action=argparse.BooleanOptionalAction, help=frames)
     prior = "start from it (made by `wildghand pretrain`; default: the one that ships)"
     add("--prior", type=Path, metavar="PRIOR", help=prior)
-    live = "show the fit in the browser while it runs (needs viser); changes nothing of it"
+    live = "show the fit in the browser while it runs (needs viser); does not change it"
     add("--live", action="store_true", help=live)
     add_address(parser)
     log = "write curves of the fit for TensorBoard (needs tensorboard)"
@@ -111,6 +111,7 @@ def _do_fit(args: argparse.Namespace) -> int:
 
 
 def _video(args: argparse.Namespace, world: World) -> int:
+    from hwp_bench.base.console import notice
     from wildghand.from_video import VideoFit, make_avatar
 
     options = VideoFit(
@@ -137,7 +138,7 @@ def _video(args: argparse.Namespace, world: World) -> int:
         )
     if world.is_main:
         print_json(made.facts()) if args.json else _print(made)
-        say_next("wildghand", "view", made.facts()["avatar"])
+        notice(f"next: open {made.facts()['page']} in a browser")
     return 0
 
 
@@ -222,7 +223,7 @@ stopped run continues when the same command is given again.
 def _add_pretrain(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _PRETRAIN_EXAMPLES
     add = parser.add_argument
-    add("captures", type=Path, nargs="+", metavar="CAPTURE", help="what to fit jointly")
+    add("captures", type=Path, nargs="+", metavar="CAPTURE", help="capture folder")
     add("-o", "--out", type=Path, required=True, help="prior to make, a folder")
     steps = "optimizer steps over all captures (default: those of a fit for each capture)"
     add_fitting(parser, steps)

@@ -20,10 +20,10 @@ _COMMANDS = {
         "judge": ("study", "judge the frames of a capture: clean or perturbed"),
         "explain": ("study", "show what the biases took out of training frames"),
         "stage": ("show", "draw an avatar and its cameras in 3D"),
+        "network": ("study", "list the layers and parameters of the network"),
         "pretrain": ("fit", "fit one network to several captures, as a prior for fits"),
     },
     "other": {
-        "info": ("study", "print versions and check what draws on this machine"),
         "completion": ("study", "print completion for a shell"),
     },
 }

@@ -44,7 +44,7 @@ def add_fitting(parser: argparse.ArgumentParser, steps: str) -> None:
     """Add `--steps`, `--seed` and `--set`, which `check_fitting` checks."""
     add = parser.add_argument
     add("--steps", type=int, help=steps)
-    add("--seed", type=int, default=0, help="of everything random (default: 0)")
+    add("--seed", type=int, default=0, help="seed of all random numbers (default: 0)")
     text = "a setting, as schedule.batch=4 (wildghand/model/settings.py); may be repeated"
     add("--set", action="append", default=[], metavar="NAME=VALUE", help=text)
 

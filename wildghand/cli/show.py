@@ -159,7 +159,7 @@ def _add_export(parser: argparse.ArgumentParser) -> None:
     turned = "for SuperSplat: opens upright, palm to the viewer, ten units in a metre (.ply)"
     add("--supersplat", action="store_true", help=turned)
     degree = (
-        "how finely colours of Gaussians change with the side they are seen from, 0 to 3 "
+        "how strongly colours of Gaussians may depend on the view, 0 to 3 "
         "(default: 3; 0: one colour each, and a third of the size)"
     )
     add("--harmonics", type=int, default=3, metavar="DEGREE", help=degree)

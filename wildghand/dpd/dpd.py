@@ -211,7 +211,7 @@ class DynamicPerturbation(nn.Module):
         return Temporal(z, 2.0 * torch.sigmoid(self.psi(z).squeeze(-1)) - 1.0)
 
     def move(self, pose: Tensor, transl: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Poses (B, 16, 3) and translations (B, 3) as the pose head by time corrects them."""
+        """Correct poses (B, 16, 3) and translations (B, 3) by the pose head."""
         if self.pose_head is None:
             return pose, transl
         seen = torch.cat((pose.flatten(1), transl, z), dim=-1)

@@ -152,7 +152,7 @@ def _shares(places: np.ndarray, normals: np.ndarray) -> np.ndarray:
 
 
 def _in_sight(vertices: np.ndarray, faces: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """(M,) whether nothing hides places of a mesh from the camera at the origin."""
+    """(M,) whether places of a mesh are visible from a camera at the origin."""
     distance = np.linalg.norm(places, axis=1)
     ray, _, _, _, met = ray_mesh(vertices, faces).first_hits(
         np.zeros((1, 3)), places / distance[:, None]

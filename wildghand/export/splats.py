@@ -59,7 +59,7 @@ SH_CONSTANT = 0.28209479177387814
 class PosedCamera:
     """Hands in front of a camera."""
 
-    #: By side; in the poses that the fit believes in.
+    #: By side; in the fit's corrected poses.
     hands: Mapping[str, HandPose]
     #: (4, 4) world to camera.
     viewmat: np.ndarray
@@ -279,7 +279,7 @@ def for_supersplat(
 
 
 def _owners(avatar: WildGHandAvatar, sides: tuple[str, ...]) -> np.ndarray:
-    """(N,) which hand each Gaussian belongs to: those of the hands, then those of their walls."""
+    """(N,) which hand each Gaussian belongs to: those of the hands, then those of their caps."""
     counts = [len(avatar.model.rigs[side]) for side in sides]
     for side in sides:
         wall = avatar.model.wall(side)

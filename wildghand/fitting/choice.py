@@ -1,6 +1,5 @@
-"""Choices by validation frames, which no step sees, and the states of a fit that they choose from.
-
-`wildghand.plain.choice` says what states these are.
+"""Choices by validation frames, which no step sees, among the states of a fit; see
+`wildghand.plain.choice`.
 """
 
 from __future__ import annotations
@@ -81,7 +80,7 @@ class JudgedDrawings:
 
     @torch.no_grad()
     def predict(self, row: int, features: Mapping[str, HandFeatures]) -> Predicted:
-        """What network and light say of the hands in a frame."""
+        """Predict the hands in a frame by network and light."""
         here = slice(row, row + 1)
         return {
             side: self.model.predict_hand(
@@ -91,7 +90,7 @@ class JudgedDrawings:
         }
 
     def predict_all(self) -> dict[int, Predicted]:
-        """What network and light say of the hands in all frames, by row."""
+        """Predict the hands in all frames by network and light, by row."""
         features = self.features()
         return {row: self.predict(row, features) for row in range(len(self.frames))}
 
@@ -133,7 +132,7 @@ class JudgedDrawings:
 
     @functools.cached_property
     def _dark(self) -> ShadowTable | None:
-        """The shadows in the frames, cast at once: whoever draws one first has cast them all."""
+        """The shadows in the frames, all cast when the first one is drawn."""
         if self.model.shadows is None:
             return None
         dark = ShadowTable(self.model.shadows, self._clip)
@@ -167,7 +166,7 @@ class AveragedSteps(Averaging, Component):
         self.take()
 
     def after(self, fit: Fit) -> None:
-        """Put the mean in place."""
+        """Replace the last state by the mean."""
         self.put()
 
     def checkpoint(self, avatar: Avatar) -> Avatar:
@@ -178,7 +177,7 @@ class AveragedSteps(Averaging, Component):
 class StateChoice(KeptStates, Component):
     """After the last step a fit goes back to a better earlier state; see `KeptStates`.
 
-    Visibility is chosen for the state that is kept, and has no say before.
+    Visibility is chosen for the state that is kept, and not used before.
 
     Attributes:
         judges: validation frames; None: the fit ends with its last state.

@@ -63,7 +63,7 @@ _MEAN = 1e-6
 
 
 class StartColors(Component):
-    """Colours that no skin has are read from the frames before the first step.
+    """Colours that skin does not have are read from the frames before the first step.
 
     The prior knows skin. From there it takes hundreds of steps to the palm of a green glove that
     few frames show, and a short fit ends on the way. So where the frames show a tint that is far
@@ -96,9 +96,9 @@ class FilledColors:
     def carried_on(self, shares: Sequence[float]) -> list[ColorChanges | None]:
         """The changes of colours for some values of `visibility.fill_share`; None: nothing changes.
 
-        With a share of 0 the skin around a place says nothing of it unless no frame shows it, and
-        the other hand all the same. Colours are compared at normals that the clip's light knows;
-        without one none change.
+        With a share of 0 the skin around a place counts only if no frame shows the place; the other
+        hand counts always. Colours are compared at normals that the clip's light knows; without one
+        none change.
         """
         model, clip, light = self.fit.model, self.fit.clip, self.fit.model.light
         if light is None or not self.fit.settings.visibility.fill_share:
@@ -138,7 +138,7 @@ class FilledColors:
         return found
 
     def _kept(self, side: str, half: float) -> np.ndarray:
-        """(N,) in [0, 1), how far the colours of a hand are known."""
+        """(N,) in [0, 1), how well the colours of a hand are known."""
         shown = torch.where(self.unseen[side], 0.0, self.shown[side])
         return np.asarray(kept_share(shown.double().cpu(), half))
 
@@ -244,7 +244,7 @@ def known_normals(light: KnownLight) -> Tensor:
 
 
 def log_linear(logits: np.ndarray) -> np.ndarray:
-    """Logarithm of linear light of colours in logits of sRGB."""
+    """Return the logarithm of linear light of colours that are given as logits of sRGB."""
     linear = srgb_to_linear(1.0 / (1.0 + np.exp(-logits)))
     return np.log(np.clip(linear, _DARKEST, 1.0))
 
@@ -252,11 +252,11 @@ def log_linear(logits: np.ndarray) -> np.ndarray:
 def changes_to(
     levels: Mapping[str, np.ndarray], logits: Mapping[str, np.ndarray], device: torch.device
 ) -> ColorChanges:
-    """The changes that bring colours to others.
+    """Return the changes that turn given colours into others.
 
     Args:
-        levels: (N, 3) by side, logarithms of linear light, where they are to be.
-        logits: (N, 3) by side, of sRGB, where they are.
+        levels: (N, 3) by side, the wanted colours as logarithms of linear light.
+        logits: (N, 3) by side, the given colours as logits of sRGB.
     """
     changes = {}
     for side, aim in levels.items():

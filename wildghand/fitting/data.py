@@ -57,7 +57,7 @@ class FitData:
         device: where the fit runs.
 
     Attributes:
-        training: with the hands that the fit believes in.
+        training: with corrected poses, where the fit corrects them.
         templates: by side, of the hand model.
         subject: how the person's hand differs from them; None: not at all.
         judgement: of the frames.
@@ -143,12 +143,12 @@ class FitData:
         )
 
     def uncovered(self, rows: Tensor) -> Tensor | None:
-        """(B, H, W) in [0, 1], what the pre-pass leaves of the pixels of B frames; None: all."""
+        """(B, H, W) in [0, 1], the pre-pass's weights of the pixels of B frames; None: all 1."""
         pixels = self.judgement.pixels
         return None if pixels is None else shares_of_255(pixels[rows], self.device)
 
     def visible(self, rows: Tensor) -> Tensor:
-        """How much each pixel of some frames says of the hand, (B, H, W) in [0, 1].
+        """How much each pixel of some frames shows the hand, (B, H, W) in [0, 1].
 
         Args:
             rows: (B,) int64, which of the R frames; on the CPU.
@@ -162,7 +162,7 @@ class FitData:
 def skin_places(
     training: TrainingCapture, frames: TrainingFrames, templates: Mapping[str, HandTemplate]
 ) -> list[np.ndarray]:
-    """Number the places of a hand, and say which of them each pixel shows.
+    """Number the places of a hand, and find the one that each pixel shows.
 
     Returns:
         R times (H, W) uint16: 0 where the posed hands are not, else the place, numbered without

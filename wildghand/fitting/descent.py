@@ -107,7 +107,7 @@ class Descent:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from a saved state; the model's must be loaded before."""
+        """Continue from a saved state; the model's must be loaded before."""
         self.optimizer.load_state_dict(state["optimizer"])
         self.shared.load_state_dict(state["shared"])
         self.steps, self.skipped = int(state["steps"]), state["skipped"]
@@ -224,7 +224,7 @@ class SharedFeatures:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from a saved state; the network's own must be loaded before."""
+        """Continue from a saved state; the network's own must be loaded before."""
         self._close()
         if not state["steps"]:
             return

@@ -93,7 +93,7 @@ class Component:
         """After that, when everything that steps move is known."""
 
     def parameters(self) -> dict[str, Iterable[Tensor]]:
-        """What steps move besides the model, by the name of its rate."""
+        """Parameters that Adam changes besides the model's, by the name of their rate."""
         return {}
 
     def draws(self, fit: Fit, batch: StepBatch) -> DrawOptions:
@@ -142,7 +142,7 @@ class Component:
         return {}
 
     def state_dict(self) -> dict[str, Any]:
-        """What steps change, for `load_state_dict`; it may wait for the device."""
+        """The state that steps change, for `load_state_dict`; it may wait for the device."""
         return {}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -157,11 +157,11 @@ class Fit(IterativeFit[WildGHandAvatar]):
 
     Args:
         training: what may be seen of the capture.
-        settings: how.
+        settings: of the fit.
         seed: of anchors, initial weights, order of the frames, and dropout.
-        device: where it runs.
+        device: on which it runs.
         world: the processes that share its batches.
-        components: its ideas, in order.
+        components: in the order in which their hooks are called.
 
     Raises:
         BadInput: no training frame can be used, or the prior is damaged or of another kind.
@@ -422,7 +422,7 @@ class Fit(IterativeFit[WildGHandAvatar]):
         return {type(each).__name__: each.state_dict() for each in self.components}
 
     def load_component_states(self, states: Mapping[str, Mapping[str, Any]]) -> None:
-        """Go on from saved states of the components."""
+        """Continue from saved states of the components."""
         for component in self.components:
             component.load_state_dict(states[type(component).__name__])
 

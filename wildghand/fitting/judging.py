@@ -92,7 +92,7 @@ class HiddenSkin(Component):
     """Pixels in which something hides the hand are compared with nothing."""
 
     def before(self, fit: Fit) -> None:
-        """Find these pixels."""
+        """Find the hidden pixels before the first step."""
         frames = fit.data.frames
         hidden = torch.from_numpy(hidden_skin(fit.data.places, frames.masks.numpy()))
         self._hidden = FrameTable(

@@ -1,7 +1,7 @@
 """Light in a fit: the shadows that hands cast, before it, and the light beyond its normals, after.
 
-Both are told by places of the skin that turn: shadows by their colours in the frames, as the
-network does not exist yet; the light by what the finished model says of them.
+Both follow from places of the skin that turn: shadows from their colours in the frames, because
+there is no network yet; the light from the finished model's colours.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ CHUNK = 16
 
 
 class Lighting(Component):
-    """Hands cast shadows under a light that frames tell (`shadows`), and normals that no frame has
-    shown are drawn by a light that is fitted to the others (`light`).
+    """Hands cast shadows under a light that is estimated from the frames (`shadows`), and normals
+    that no frame has shown are drawn by a light that is fitted to the others (`light`).
     """
 
     def __init__(self) -> None:
@@ -80,7 +80,7 @@ class Lighting(Component):
             fit.model.keep(found)
 
     def seconds(self, fit: Fit) -> float:
-        """The light of a few frames is fitted to see how long that takes."""
+        """Measure the time by fitting the light of a few frames."""
         if not fit.settings.light.enabled:
             return 0.0
 
@@ -97,7 +97,7 @@ class Lighting(Component):
 
 
 def learn_light(fit: Fit, frames: int | None = None) -> KnownLight | None:
-    """Fit a light to what a model says of the clip; None where too little of it is seen."""
+    """Fit a light to the model's colours in the clip; None if too little of the hand is seen."""
     count = len(fit.data.frames)
     read = count if frames is None else frames
     return fit_light(light_samples(fit, read, SAMPLES * read // count))

@@ -51,8 +51,8 @@ class WildGHandMethod:
 
     @denormals_flushed()
     def fit(self, training: TrainingCapture, budget: Budget, report: Report) -> WildGHandAvatar:
-        """Fit an avatar to the training frames (validation frames only choose
-        what training frames cannot tell; see `wildghand.fitting.choice`).
+        """Fit an avatar to the training frames (validation frames only choose what training frames
+        cannot decide; see `wildghand.fitting.choice`).
 
         Args:
             training: what the method may see of the capture.

@@ -96,7 +96,7 @@ class Regularisers(Component):
                 yield attribute_roughness(self._laplacians[side], raw, *rough)
 
     def loss_of_features(self, fit: Fit, features: Features) -> Tensor | None:
-        """Smooth offsets of the template (head iii), and like texture of both hands."""
+        """Penalise rough offsets of the template (head iii), and unlike textures of both hands."""
         weights, found = fit.settings.terms.fixed, []
         if weights.laplacian_offsets and fit.settings.heads:
             for side, hand in features.items():

@@ -31,7 +31,7 @@ class PeerLost(HwpError):
 
 
 class World:
-    """The processes of a fit, and what they tell each other.
+    """The processes of a fit and their messages.
 
     A single process is a world as well: nothing is sent, and tensors come back as they are.
 
@@ -72,7 +72,7 @@ class World:
         return slice(self.rank * each, (self.rank + 1) * each)
 
     def average_(self, tensor: Tensor) -> Tensor:
-        """Put the mean over the processes in place of a tensor; every process gets the same."""
+        """Replace a tensor by its mean over the processes; every process gets the same."""
         if self.size == 1:
             return tensor
         with _talking():

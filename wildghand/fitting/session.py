@@ -168,7 +168,7 @@ def _fit_in(
     device = ready_fit(chosen.device)
     if world.is_main:
         ready = time.perf_counter() - entered
-        notice(f"Kernels made ready in {ready:.1f} s, which the seconds of the fit leave out.")
+        notice(f"Kernels ready after {ready:.1f} s, which do not count as seconds of the fit.")
     fit = make_fit(training, chosen, run.seed, device, world)
 
     def look(step: int, loss: Loss) -> None:
@@ -210,7 +210,7 @@ def run_resumed(
     if state.is_file():
         start, before = load_state(state, fit, watchers, digest)
         if is_main:
-            notice(f"Going on after {start} steps.")
+            notice(f"Continuing after {start} steps.")
     begin(start)
     with contextlib.ExitStack() as stack:
         show: Callable[[int], None] = lambda done: None  # noqa: E731

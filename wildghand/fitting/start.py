@@ -24,7 +24,7 @@ class Poses(Component):
         self.remembered: ClipPoses | None = None
 
     def prepare(self, fit: Fit) -> None:
-        """Put the capture with corrected hands in place of the given one."""
+        """Replace the capture by one with corrected hands."""
         training, templates = fit.data.training, fit.data.templates
         believed = believed_hands(templates, training.hands, training.cameras)
         self.remembered = ClipPoses.of(training.hands, believed)
@@ -32,7 +32,7 @@ class Poses(Component):
             fit.data.training = training.with_hands(believed)
 
     def before(self, fit: Fit) -> None:
-        """Let the model keep what is believed."""
+        """Let the model keep the corrected poses."""
         if self.remembered is not None:
             fit.model.keep(self.remembered)
 
@@ -77,7 +77,7 @@ class StartFromPrior(Component):
         self._source: dict[str, str] = {}
 
     def before(self, fit: Fit) -> None:
-        """Put the prior's weights in place of the network's."""
+        """Replace the network's weights by the prior's."""
         network = fit.model.network
         prior = choose_prior(fit.settings, fit.data.training.hand_model, network)
         if prior is not None:

@@ -1,12 +1,13 @@
 """Gaussians that few frames have shown: discs on the skin, where validation frames agree.
 
-Those that no frame shows are discs from where the camera never stood, in the colours of the skin
-around them. From behind they are as they were learnt: they shine through the skin that frames show.
+Those that no frame shows are drawn as discs from directions in which the camera never stood, in the
+colours of the skin around them. From behind, where they shine through visible skin, they keep their
+learnt shape.
 
-Where a person's hand is far from the hand model, offsets from the skin are the person's and not
-errors of depth, and visibility takes away what is right. Where a palm has another colour than the
-back, as that of a glove, the back says nothing of it. Nothing in the training frames tells: they
-are drawn without visibility, and show other places.
+If a person's hand differs much from the hand model, offsets from the skin are real and not errors
+of depth, and visibility would remove them. If the palm has another colour than the back, as with
+some gloves, the back does not predict it. Training frames cannot decide this, because they show
+other places; validation frames do.
 """
 
 from __future__ import annotations
@@ -163,7 +164,7 @@ class FewShown(Component):
             fit.model.keep(best)
 
     def best(self, fit: Fit) -> list[Visibility | ColorChanges]:
-        """What draws validation frames best; without what is the model's own already.
+        """The choice that draws validation frames best, less what the model already has.
 
         Where nothing is judged, these are the shares of the settings. In each case
         Gaussians that close gaps are spared.
@@ -232,7 +233,7 @@ class FewShown(Component):
         return total
 
     def _strongest(self, fit: Fit) -> Visibility:
-        """What opens the most."""
+        """Return the strongest visibility of those that are tried."""
         several = strengths(fit.settings.visibility)
         return self._weigh(fit, max(several, key=lambda each: each.offset_share))
 

@@ -63,7 +63,7 @@ class MadeAvatar:
         return read_verdict(self.job.verdict) if self.job.verdict.is_file() else None
 
     def facts(self) -> dict[str, Any]:
-        """Return what a program wants to know of it, for JSON."""
+        """Return the facts about the avatar, for JSON."""
         fit, job, verdict = self.avatar.record, self.job, self.verdict()
         return {
             "avatar": str(job.folder),
@@ -223,7 +223,7 @@ def fit(
             of `WildGHandSettings`, dotted for those of a component.
         seconds: limit of the fit, s.
         steps: limit of the fit in optimizer steps.
-        seed: seed of everything random.
+        seed: seed of all random numbers.
         all_frames: fit the validation and test frames too: for an avatar, not for a score. None:
             those of a video, not those of a capture.
         overwrite: replace an avatar that is there.

@@ -72,7 +72,7 @@ class VideoFit:
     steps: int | None = None
     #: Most seconds of optimizing, or None.
     seconds: float | None = None
-    #: Of everything random.
+    #: Seed of all random numbers.
     seed: int = 0
     #: Settings of the method, as `wildghand.model.settings.read_settings` takes them; they win
     #: over those of `quick`.
@@ -164,7 +164,7 @@ class Stage(ABC):
 
     @abstractmethod
     def facts(self, job: VideoJob) -> dict[str, str]:
-        """What its result depends on: digests and settings, by a name that a person understands.
+        """Digests and settings on which the result depends, by a readable name.
 
         The stages before it have ended when this is called.
         """

@@ -146,7 +146,7 @@ def parts_of(rig: HandRig, side: str) -> dict[str, np.ndarray]:
 
 
 def _score(avatar: WildGHandAvatar, capture: Capture) -> tuple[float | None, int, Any]:
-    """PSNR over test frames where the fit has not seen them, else over fitted ones."""
+    """PSNR over the test frames if the fit has not seen them, else over fitted frames."""
     test = contiguous_split(capture.info.id, len(capture)).test
     test = test[np.all([capture.hands[side].valid[test] for side in avatar.sides], axis=0)]
     # A fit of every frame leaves the last two as well.

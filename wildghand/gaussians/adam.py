@@ -104,7 +104,7 @@ class ClippedAdam(torch.optim.Adam):
         torch._foreach_sub_(steps, [stopped] * len(steps))
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go on from a saved state, also one of `torch.optim.Adam` over the same groups."""
+        """Continue from a saved state, also one of `torch.optim.Adam` over the same groups."""
         clipped = [group.get("clipped", True) for group in self.param_groups]
         super().load_state_dict(state_dict)
         for group, held in zip(self.param_groups, clipped, strict=True):

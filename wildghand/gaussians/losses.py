@@ -146,7 +146,7 @@ def _sum_moments(images, image, row, first, last, window, blurred):
 
 @inline
 def _clear_ends(blurred, pad, first, last):
-    """Zeros where windows reach beyond what was summed."""
+    """Write zeros where windows reach beyond the sums."""
     for m in range(blurred.shape[0]):
         for k in range(pad):
             blurred[m, first + k] = blurred[m, pad + last + k] = _ZERO

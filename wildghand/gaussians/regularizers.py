@@ -1,4 +1,4 @@
-"""What keeps Gaussians even and closed over the skin: a Laplacian, and flat opaque discs.
+"""Penalties that keep Gaussians even and closed over the skin: a Laplacian, and flat opaque discs.
 
 A picture says nothing of the side of the hand that it does not show, nor how far a Gaussian that
 faces the camera reaches along the line of sight, nor whether the one behind it is there at all.
@@ -176,7 +176,7 @@ _TINY = 1e-8
 def off_surface(
     raw: RawAttributes, activation: Activation, spacing: float, *, flatness: float = 0.0
 ) -> Tensor:
-    """Mean over Gaussians and frames of what keeps them from closing the surface.
+    """Mean penalty, over Gaussians and frames, of shapes that leave gaps in the surface.
 
     Args:
         raw: (B, N, k) attributes.

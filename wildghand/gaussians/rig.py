@@ -505,7 +505,7 @@ class HandRig:
 
     @functools.cached_property
     def tables(self) -> PosingTables:
-        """What posing on the CPU reads; made once."""
+        """Tables for posing on the CPU; made once."""
         return PosingTables.of(self.template, self.anchors)
 
 

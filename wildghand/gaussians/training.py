@@ -42,7 +42,7 @@ class FrameTable:
         self._made: torch.Tensor | None = None
 
     def __call__(self, rows: torch.Tensor) -> torch.Tensor:
-        """What belongs to (B,) rows: (B, ...); it must not be changed."""
+        """Return the values of (B,) rows: (B, ...); they must not be changed."""
         if not len(self._all):
             return self._make(rows)
         if self._made is None:
@@ -102,7 +102,7 @@ class TrainingFrames:
         return len(self.indices)
 
     def images_on(self, device: torch.device) -> FrameTable:
-        """What renderings are compared with: (H, W, 3) float32, black outside the mask."""
+        """Targets of renderings: (H, W, 3) float32, black outside the mask."""
 
         def make(rows: torch.Tensor) -> torch.Tensor:
             images = upload(self.images[rows], device).float() / 255.0

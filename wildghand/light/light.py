@@ -12,7 +12,7 @@ Weights fall with residuals, so that what objects and wrong poses do to single s
 little.
 
 After a fit, `fit_light` carries colours on (`KnownLight`). A camera that stands still shows normals
-of one half of the sphere; what a network says about the other half is chance. So a light with
+of one half of the sphere; a network's colours of the other half are chance. So a light with
 nothing in its way is fitted to the colours that the network gives to normals that frames have
 shown; beyond them the network is asked for the nearest known normal, and its colour is multiplied
 by the ratio of both irradiances. Residuals count in shares of the albedo alone here: in shares of
@@ -118,7 +118,7 @@ class CastLight(Found):
 
 @dataclass(frozen=True, eq=False)
 class KnownLight(Found):
-    """A light with nothing in its way, and the cap of the normals in which frames have shown it."""
+    """A light without shadows, and the cap of normals for which frames have shown it."""
 
     prefix = "light_"
     longest: ClassVar = {"K": 4096}
@@ -155,7 +155,7 @@ class KnownLight(Found):
         return ratio.clamp(_LEAST, _MOST)
 
     def unknown(self, normals: Tensor, facing: Tensor) -> Tensor:
-        """How far a normal is unknown, (...) in [0, 1].
+        """How little is known about a normal, (...) in [0, 1].
 
         Args:
             normals: (..., 3) of length 1.
@@ -186,7 +186,7 @@ class LightSamples:
         return np.maximum(self.normals @ directions.T, 0.0) * self.free(directions)
 
     def suffice(self, count: int) -> bool:
-        """Whether so many numbers can be told from them."""
+        """Whether that many numbers can be estimated from them."""
         return len(self.places) >= count and bool(self.weights.sum() > 0.0)
 
 
@@ -231,7 +231,7 @@ def find_light(
 
 
 def fit_light(samples: LightSamples, *, ridge: float = 0.03) -> KnownLight | None:
-    """Fit a light to what the network says of places that turn; None where they are too few.
+    """Fit a light to the network's colours of places that turn; None if they are too few.
 
     Args:
         ridge: on the strengths, in the mean size of the normal matrix's diagonal.

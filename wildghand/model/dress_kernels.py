@@ -138,7 +138,7 @@ def dress_pieces_backward(
     """Gradients of `dress_pieces`; `means` have that of the positions.
 
     Args:
-        share: (B,) float32, how much what all frames share learns from each.
+        share: (B,) float32, weight of each frame in the gradients that all frames share.
         of_raw: (B, N, 14), of_moved: (N, 3), of_shadow: (B, N) float32, filled.
         of_field: as `field`, float32, filled.
         of_mixing: (pieces, 14, 14), of_shift: (pieces, B, 14), of_omega: (pieces, B) float32

@@ -1,8 +1,8 @@
 """The model that is fitted: network, perturbation biases, frame-wise corrections, and drawing.
 
-A hand in free poses is drawn in two stages. What network and light say comes first and takes
-longest (`predict_hand`). What visibility, changes of colours, shadows and the refined pose make of
-it comes second (`dressed`), so that it can be tried in several ways.
+A hand in free poses is drawn in two stages. The prediction by network and light comes first and
+takes longest (`predict_hand`). What visibility, changes of colours, shadows and the refined pose
+make of it comes second (`dressed`), so that it can be tried in several ways.
 """
 
 from __future__ import annotations
@@ -78,9 +78,9 @@ class WildGHandModel(nn.Module):
 
     Attributes:
         log_gains: (R, 3) log of the gain on the sRGB image of each frame.
-        light: by which unknown normals are drawn in free poses; None: as the network says.
-        visibility: by which free poses are drawn; None: as they were learnt.
-        clip_poses: what is believed of the poses that the clip gives; None: what it gives.
+        light: for unknown normals in free poses; None keeps the network's colours.
+        visibility: for free poses; None keeps the learnt Gaussians.
+        clip_poses: corrected poses of the clip; None keeps the given ones.
         color_changes: of places that few frames have shown, in free poses; None: none.
         shadows: the hands in the light that casts shadows; None: the network alone says how bright
             skin is.
@@ -248,7 +248,7 @@ class WildGHandModel(nn.Module):
     def perturbation_in(
         self, side: str, temporal: Temporal, anchors: AnchorPoses, kept: Tensor | None
     ) -> FramePerturbation:
-        """The perturbation of one hand in B frames, with its field where that can be seen."""
+        """The perturbation of one hand in B frames, with its field of biases where there is one."""
         module, field = self.biases_of(side), None
         # Off the CPU the question would wait for the device.
         unseen = kept is not None and kept.device.type == "cpu" and not bool(kept.any())
@@ -269,7 +269,7 @@ class WildGHandModel(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Draw hands in any pose, free of what perturbed the training frames.
 
-        With `visibility`, a wall closes the open end of the wrist, which no frame looks into.
+        With `visibility`, a cap closes the open end of the wrist, into which no frame looks.
 
         Args:
             hands: pose (B, 16, 3), betas (10,), transl (B, 3) by side.
@@ -299,12 +299,12 @@ class WildGHandModel(nn.Module):
         width: int,
         height: int,
     ) -> tuple[Tensor, Tensor]:
-        """Draw hands and their walls."""
+        """Draw hands and their caps."""
         parts = [made for made, _ in found.values()] + self.walls(found)
         return rasterize_hands(parts, viewmats, Ks, width, height)
 
     def wall(self, side: str) -> WristWall | None:
-        """What ends the wrist of one hand; None without visibility, or where it stays open."""
+        """The cap of one hand's wrist; None without visibility, or where the wrist stays open."""
         if self.visibility is None or side in self.visibility.open_wrists:
             return None
         return self._walls.get(side)
@@ -356,7 +356,7 @@ class WildGHandModel(nn.Module):
         viewmats: Tensor | None,
         features: HandFeatures | None = None,
     ) -> HandPrediction:
-        """What network and light say of one hand.
+        """Predict one hand by network and light.
 
         Args:
             hand: pose (B, 16, 3), betas (10,) and translation (B, 3).

@@ -1,9 +1,9 @@
-"""A wall across the open end of a wrist, and a clean edge around it.
+"""A cap across the open end of a wrist, and a clean edge around it.
 
-A hand model ends at the wrist, and its mesh is open there. Whoever looks into it sees the inside of
-the skin, which no frame has shown and which the fit has left thin in places: holes. A wall of
-opaque discs, two millimetres inside the hand, closes it. Gaussians reach over the border by as much
-as each is wide, so that it would look like the edge of a saw: they are pressed together before it.
+A hand model ends at the wrist, and its mesh is open there. A camera that looks into it sees the
+inside of the skin, which no frame has shown and which has holes. A cap of opaque discs, two
+millimetres inside the hand, closes it. Gaussians reach over the border by their own width, which
+would give a jagged edge, so they are flattened towards the border.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from wildghand.model.dress import Gaussians
 SPACING, DEPTH = 0.002, 0.002
 # How far along the skin, from the border, Gaussians lend them their colour, m.
 _NEAR = 0.025
-#: A disc's standard deviations along the wall and across it, in spacings, and its opacity.
+#: A disc's standard deviations along the cap and across it, in spacings, and its opacity.
 WIDE, THIN, OPAQUE = 0.7, 0.2, 0.98
 # m: no wrist is wider; the subject of a damaged avatar may be.
 _WIDEST = 0.2
@@ -47,7 +47,7 @@ class WristWall:
     border: Tensor
     #: (M, L), rows sum to 1: discs lie at these means of the border's vertices.
     shares: Tensor
-    #: (K,) int64, at least one: Gaussians of the wrist, whose median colour the wall has.
+    #: (K,) int64, at least one: Gaussians of the wrist, whose median colour the cap has.
     skin: Tensor
 
     def __len__(self) -> int:
@@ -55,7 +55,7 @@ class WristWall:
 
     @classmethod
     def of(cls, rig: HandRig) -> WristWall | None:
-        """The wall of a hand; None where its mesh is closed or the open end too narrow or wide."""
+        """Return the cap of a hand; None if its mesh is closed or its open end unusual in size."""
         vertices, faces = rig.template.vertices, rig.template.faces
         border = torch.from_numpy(boundary_loop(faces.cpu().numpy())).to(vertices.device)
         if not len(border):
@@ -71,7 +71,7 @@ class WristWall:
         return cls(rig.template, border, torch.from_numpy(shares).to(vertices), skin)
 
     def close(self, hand: Gaussians, pose: Tensor, betas: Tensor, transl: Tensor) -> Gaussians:
-        """The wall of a posed hand.
+        """Return the cap of a posed hand.
 
         Args:
             pose: (B, 16, 3) axis-angle, rad.

@@ -1,13 +1,13 @@
 """Content of a page: a hand's surface, its Gaussians, and the layers of the model that see a pose.
 
-Most of a compact network sees no pose: for each Gaussian it comes down to 14 numbers. What does
-see the pose (the geometry branch and what the heads make of it) is a few small layers, which the
-page evaluates at each Gaussian. How the network corrects the pose follows from the mean of the
-geometry branch, which the page finds at some Gaussians (`refinement_content`).
+Most of a compact network sees no pose: for each Gaussian it comes down to 14 numbers. The rest (the
+geometry branch and the heads on it) is a few small layers, which the page evaluates at each
+Gaussian. How the network corrects the pose follows from the mean of the geometry branch, which the
+page finds at some Gaussians (`refinement_content`).
 
-A network that is too large for that is drawn in many poses instead. What it says becomes a mean and
-principal components, whose coefficients, as the corrections, are regressed on the rotations of the
-joints (`PoseBasis`).
+A network that is too large for that is evaluated in many poses instead. Its outputs become a mean
+and principal components, whose coefficients, as the corrections, are regressed on the rotations of
+the joints (`PoseBasis`).
 """
 
 from __future__ import annotations
@@ -206,7 +206,7 @@ def hand_content(
     Args:
         poses: (P, 16, 3) rad, in which the network is asked.
         tabled: the network is too large for the page.
-        rank: principal components of what such a network says.
+        rank: number of principal components of such a network's outputs.
     """
     model, settings = avatar.model, avatar.settings
     rig, network, wall = model.rigs[side], model.network, model.wall(side)
@@ -331,7 +331,7 @@ def _unseen(avatar: WildGHandAvatar, side: str) -> torch.Tensor:
 
 
 def _disc(avatar: WildGHandAvatar, side: str) -> list[float]:
-    """(14,) attributes of a Gaussian of which no frame says anything."""
+    """(14,) attributes of a Gaussian that no frame shows."""
     rig, none = avatar.model.rigs[side], {side: torch.zeros(1)}
     blank = RawAttributes.split(torch.zeros(1, CHANNELS))
     bias = avatar.model.network.activation.log_scale_bias
@@ -340,7 +340,7 @@ def _disc(avatar: WildGHandAvatar, side: str) -> list[float]:
 
 @dataclass(frozen=True, eq=False)
 class _WallRows:
-    """The M discs of a wall as anchors on triangles of its middle and two of its border."""
+    """The M discs of a wrist's cap as anchors on triangles of its middle and two of its border."""
 
     #: (M, 3) numbers of vertices: the middle follows those of the hand, and then the border.
     corners: np.ndarray

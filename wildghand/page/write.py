@@ -119,8 +119,8 @@ def best_start(
     """Hands in the studio, lit as in the frames.
 
     Of the poses of fingers that are tried, or else at rest, in each turn, it is the one with most
-    skin to the camera that frames show well, less the skin that they do not. A clip says how a hand
-    looks in its own poses: at rest the insides of fingers that are always bent would be blotches.
+    skin to the camera that frames show well, less the skin that they do not. A clip shows a hand in
+    its own poses only: at rest the insides of fingers that are always bent would be blotches.
     """
     studio, visibility, rigs = avatar.studio, avatar.model.visibility, avatar.model.rigs
     if visibility is None:

@@ -144,7 +144,7 @@ def _weights_file(path: Path) -> Path:
 
 
 def _decoder_of(config: Path) -> dict[str, Any]:
-    """What no tensor's shape tells of the decoder; missing entries are those of `transformers`."""
+    """Settings of the decoder that shapes do not show; missing ones are those of `transformers`."""
     described = read_json(config)
     if not isinstance(described, dict) or described.get("model_type") != "sam":
         raise BadInput("does not describe a SamModel", where=config, remedy=_REMEDY)
@@ -159,7 +159,7 @@ def _decoder_of(config: Path) -> dict[str, Any]:
 
 
 def _sizes(tensors: Mapping[str, Tensor], decoder: dict[str, Any]) -> dict[str, Any]:
-    """The network's configuration, as the shapes of its tensors tell it."""
+    """Read the network's configuration from the shapes of its tensors."""
     vision, mask = "vision_encoder.layers", "mask_decoder"
 
     def shape(name: str) -> tuple[int, ...]:

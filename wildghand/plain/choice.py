@@ -1,12 +1,12 @@
 """The state that a fit ends with: the mean of its last steps, or an earlier such mean.
 
-A fit of seconds ends while its rates are still high: what it learnt last are the last few frames.
-The mean over the last tenth of its steps forgets which those were, and costs no step (`Averaging`).
+A fit of seconds ends while its learning rates are still high, so its last state depends on the last
+few frames. The mean over the last tenth of its steps does not, and costs no step (`Averaging`).
 
-A long fit learns what is wrong in single frames: a pose that a tracker gave, a finger that lies
-3 px off its place. It draws its training frames the better for it, and others worse. How soon
-that begins depends on how wrong the frames are, which nothing in them tells: validation frames
-choose, which no step sees (`KeptStates`).
+A long fit learns the errors of single frames, such as a tracked pose whose finger is 3 px off. It
+then draws training frames better and other frames worse. How soon that begins depends on the size
+of the errors, which is unknown. So validation frames, which no step uses, choose the state
+(`KeptStates`).
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ class Averaging:
             mean.lerp_(tensor, weight)
 
     def put(self) -> None:
-        """Put the means in place of the tensors; without a step these stay."""
+        """Replace the tensors by their means; without a step they stay."""
         if self._means:
             self.restore(self._means)
 
@@ -153,7 +153,7 @@ class Averaging:
         return {"steps": self._steps, "means": list(self._means)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from a saved state."""
+        """Continue from a saved state."""
         self._steps = int(state["steps"])
         self._means = [mean.clone() for mean in state["means"]]
 
@@ -227,7 +227,7 @@ class KeptStates:
 
         Args:
             error: of the state that the tensors are in.
-            tell: says it where an earlier state is taken.
+            tell: print a notice if an earlier state is taken.
         """
         if not self.most_drawn:
             return
@@ -249,7 +249,7 @@ class KeptStates:
         return {"steps": self._steps, "kept": dict(self._kept)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from a saved state."""
+        """Continue from a saved state."""
         self._steps = int(state["steps"])
         self._kept = {
             int(step): [value.clone() for value in values] for step, values in state["kept"].items()

@@ -29,7 +29,7 @@ Result = TypeVar("Result")
 
 
 class IterativeFit(Generic[Result]):
-    """A fit as the loop sees it. What it leaves at its default costs nothing.
+    """A fit as the loop sees it. Hooks at their defaults cost nothing.
 
     Attributes:
         device: where its tensors live.
@@ -39,7 +39,7 @@ class IterativeFit(Generic[Result]):
 
     @property
     def plateau_steps(self) -> int:
-        """Window of the plateau, at which it stops early; 0: it never does."""
+        """Steps without progress after which the fit stops early; 0: it never does."""
         return 0
 
     @property
@@ -116,7 +116,7 @@ class IterativeFit(Generic[Result]):
         raise NotImplementedError
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from a saved state."""
+        """Continue from a saved state."""
         raise NotImplementedError
 
     def tell(self, text: str) -> None:
@@ -200,7 +200,7 @@ class Watchers:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from a saved state."""
+        """Continue from a saved state."""
         self.step, self._best = int(state["step"]), state["best"]
         self._best_loss, self._before = float(state["best_loss"]), float(state["before"])
         self._skipped = int(state["skipped"])

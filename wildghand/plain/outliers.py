@@ -1,6 +1,6 @@
-"""Pixels that fit badly: their errors, rules and a network that tell inliers, and what they learn.
+"""Pixels that fit badly: their errors, rules and a network that find inliers, and what they learn.
 
-Robust losses leave outliers out. Who says which pixels these are is shared by methods: a quantile
+Robust losses leave outliers out. Methods share the ways to find these pixels: a quantile
 of recent errors, the neighbourhoods of a pixel, a network of its look, the likeness of patches.
 """
 
@@ -61,7 +61,7 @@ def find_inliers(
 
     A pixel is an inlier if its error is below the threshold, if most of its 3 x 3 neighbourhood
     is, or if it lies in the inner 8 x 8 px of a patch of 16 x 16 px of which most is. Only pixels
-    of the hand are counted: the others are black in both images, so they say nothing.
+    of the hand are counted: the others are black in both images.
 
     Args:
         errors: (B, H, W) not negative.
@@ -182,7 +182,7 @@ def chances(features: torch.Tensor, network: dict[str, torch.Tensor]) -> torch.T
 def vote_loss(
     chance: torch.Tensor, surely_in: torch.Tensor, maybe_in: torch.Tensor
 ) -> torch.Tensor:
-    """Penalty of chances that contradict what the errors say.
+    """Penalty of chances that contradict the errors.
 
     Args:
         chance: (P,) in [0, 1].

@@ -111,7 +111,7 @@ class FitInputs:
     training: TrainingCapture
     #: The frames to fit.
     frames: TrainingFrames
-    #: Of everything random.
+    #: Seed of all random numbers.
     seed: int
     #: Where the tensors live.
     device: torch.device
@@ -135,7 +135,7 @@ class Batch:
 
 @dataclass(frozen=True, eq=False)
 class Drawing:
-    """A batch as a method draws it."""
+    """A batch of frames, drawn by a method."""
 
     #: (B, H, W, 3) sRGB over black.
     image: torch.Tensor

@@ -1,4 +1,4 @@
-"""The poses of a clip: what an estimator's poses probably err by, told by the poses alone."""
+"""The poses of a clip: the probable errors of an estimator's poses, found from the poses alone."""
 
 from wildghand.poses.believe import ClipPoses, believed_hands
 

@@ -1,4 +1,4 @@
-"""The poses that a fit believes in: the given ones, less their probable errors."""
+"""The corrected poses of a clip: the given ones, less their probable errors."""
 
 from __future__ import annotations
 
@@ -33,8 +33,7 @@ _Tables = Annotated[Mapping[str, np.ndarray], Kept(("F", 51), -_LARGEST, _LARGES
 class ClipPoses(Found):
     """Poses of the frames of a clip by side, (F, 51) float32: 16 axis-angle vectors and transl.
 
-    A pose that was given by an estimator is told by its numbers, all of them: no other pose is
-    changed.
+    A pose counts as one of the clip if all of its numbers are equal; other poses are not changed.
     """
 
     prefix = "poses_"
@@ -53,7 +52,7 @@ class ClipPoses(Found):
     def of(
         cls, given: Mapping[str, HandParameters], believed: Mapping[str, HandParameters]
     ) -> ClipPoses | None:
-        """Compare given and believed hands; None where all are the same."""
+        """Compare given and corrected hands; None if all are the same."""
         changed = [side for side in given if believed[side] is not given[side]]
         if not changed:
             return None
@@ -63,7 +62,7 @@ class ClipPoses(Found):
         )
 
     def corrected(self, hands: Mapping[str, HandPose]) -> dict[str, HandPose]:
-        """The hands; one in a pose that the clip gave is in the pose that is believed."""
+        """The hands; a pose of the clip is replaced by the corrected one."""
         return {side: self._corrected(side, hand) for side, hand in hands.items()}
 
     def _corrected(self, side: str, hand: HandPose) -> HandPose:

@@ -1,4 +1,4 @@
-"""The errors of given poses, and how true poses spread, both told by the given poses alone.
+"""The errors of given poses and the spread of true ones, both estimated from the given poses alone.
 
 The form of the errors, which joints err together, is that of an estimator that goes by landmarks.
 Their size and the spread follow by factor analysis: a given pose is a true one, which comes from a
@@ -52,8 +52,8 @@ def pose_covariances(
     """Covariance of the errors of each frame's pose, up to a factor that all frames share.
 
     A pose that is fitted to 21 landmarks, in the image and in space, answers to their errors to
-    first order by least squares next to what the estimator expects. So a joint errs where landmarks
-    say little of it, and the joints of a finger make up for each other.
+    first order by least squares next to what the estimator expects. So joints have large errors
+    where landmarks constrain them little, and the joints of a finger compensate each other.
 
     Args:
         viewmats: (F, 4, 4) world to camera.
@@ -119,18 +119,18 @@ class PoseSpread:
 
 
 def error_size(poses: np.ndarray, errors: np.ndarray) -> float:
-    """Factor on the standard deviations of errors with which they explain the given poses best.
+    """Estimate the factor on the standard deviations of errors that explains the given poses best.
 
     In units of the mean covariance of the errors, true poses spread along a few directions and
     errors along all. How many directions are of the poses, q of D, is chosen by the Bayesian
     information criterion; the mean variance of the others is that of the errors.
 
     Args:
-        poses: (F, D) given; with F not above D nothing can be told.
+        poses: (F, D) given; with F at most D nothing can be estimated.
         errors: (F, D, D) covariances.
 
     Returns:
-        The factor; 0 where nothing can be told.
+        The factor; 0 where nothing can be estimated.
 
     Source: probabilistic PCA, Tipping and Bishop 1999, eq. 7 and 8; BIC, Schwarz 1978.
     """

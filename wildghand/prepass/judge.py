@@ -182,7 +182,7 @@ def _compare(found: Sequence[FrameMeasurements]) -> tuple[np.ndarray, dict[str, 
 
     Returns:
         (R, 3) log gains, relative to their mode, and by cue how far each frame is off, (R,),
-        one-sided, in robust deviations: all that speaks against it.
+        one-sided, in robust deviations.
     """
     gains = _gathered(found, "gain")
     gains = gains - densest(gains, CLEAN_SHARE)[0]
@@ -208,8 +208,8 @@ def _compare_with(
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Compare R frames with frames that are known to be clean.
 
-    A frame is off by how far a cue lies beyond those of all known frames, in the least deviations
-    that count as one: a few frames do not tell how widely clean ones spread.
+    The deviation of a frame is the distance of a cue beyond those of all known frames, in units of
+    the smallest deviation that counts: a few frames do not show how widely clean ones spread.
 
     Returns:
         What `_compare` returns; gains are relative to the median of the known frames'.
@@ -346,7 +346,7 @@ def _measurable(given: PrepassInput) -> np.ndarray:
 
 
 def _is_flat(image: np.ndarray) -> bool:
-    """Whether an image is black or has one colour: no edge, so nothing tells hand from wall."""
+    """Whether an image is black or has one colour: no edge separates hand and background."""
     pixels = image.reshape(-1, 3)
     return int(pixels.max()) < LOWEST or bool((pixels == pixels[0]).all())
 

@@ -142,7 +142,7 @@ class JointFit(IterativeFit[tuple[dict[str, Tensor], int]]):
     Args:
         trainings: what may be seen of each capture.
         settings: how each is fitted.
-        seed: of everything random.
+        seed: of all random numbers.
         device: where it runs.
 
     Raises:
@@ -238,7 +238,7 @@ class JointFit(IterativeFit[tuple[dict[str, Tensor], int]]):
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from a saved state."""
+        """Continue from a saved state."""
         self.restore(state["models"])
         own = (state["components"], state["steps"], state["skipped"])
         for fit, parts, steps, skipped in zip(self.fits, *own, strict=True):

@@ -57,7 +57,7 @@ class Prior:
     tensors: Mapping[str, Tensor]
 
     def initialise(self, network: PredictionNetwork) -> None:
-        """Put the prior in place of a network's weights.
+        """Replace a network's weights by the prior's.
 
         A hand that the prior has not seen starts from the other hand's map: the two halves of
         the atlas hold the same skin at the same places.

@@ -334,11 +334,18 @@ _ONE, _DEPTH, _ROW = (VICTIM, 1), (VICTIM, 2), (VICTIM,)
 _ALL = ()
 
 
+#: The case without a difficulty.
+_ORDINARY = "a hand"
+
+
 def cases() -> list[Case]:
     """Every hard case of the rasterizer, for the backends that this machine has."""
     backends = ("numba", "reference", *(["gsplat"] if _has_gsplat() else []))
     entries = (*_no_effects(), *_bad_views(), *_exact_scenes(), *_finite_scenes(), *_calls())
-    return [Case(name, "splat", must_hold, run, backends) for name, must_hold, run in entries]
+    return [
+        Case(name, "splat", must_hold, run, backends, quick=name == _ORDINARY)
+        for name, must_hold, run in entries
+    ]
 
 
 def _has_gsplat() -> bool:
@@ -426,6 +433,7 @@ def _exact_scenes() -> Iterator[_Entry]:
     edges = ((1, 1), (1, 50), (50, 1), (17, 33), (16, 16), (1, 4096), (4096, 1))
     points = scene.changed(scales=torch.zeros_like(scales))
     scenes: dict[str, tuple[HardScene, float | None]] = {
+        _ORDINARY: (scene, None),
         "opacity 1": (_spoilt("opacities", 1.0), None),
         "opacity 1 + 1e-7": (_spoilt("opacities", 1.0 + 1.2e-7), None),
         "opacity at the largest float32": (_spoilt("opacities", _LARGEST), math.inf),

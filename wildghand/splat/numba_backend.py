@@ -114,7 +114,7 @@ class RasterCall:
         return View(*size, o.near_plane, o.far_plane, o.eps2d, o.antialiased)
 
     def tile_scene(self, colors: torch.Tensor) -> TileScene:
-        """What both passes over tiles read."""
+        """Return the input of both passes over tiles."""
         images, gaussians = self.projected.depths.shape
         shared = _gaussians(colors)
         return TileScene(
@@ -392,7 +392,7 @@ def _check_room(entries: int) -> None:
 
 
 def _kernel_channels(size: int) -> int | tuple[int, ...]:
-    """How the blending kernels are told the number of channels, see kernels.tiles."""
+    """The form in which the blending kernels get the number of channels; see kernels.tiles."""
     return (0,) * size if size in UNROLLED else size
 
 
@@ -413,7 +413,7 @@ def _gaussians(tensor: torch.Tensor) -> np.ndarray:
 
 
 def _like_gaussians(tensor: torch.Tensor) -> torch.Tensor:
-    """Room for a gradient, with at least a group of Gaussians."""
+    """Allocate a gradient, for at least one group of Gaussians."""
     return torch.empty(tensor.shape[0], max(tensor.shape[1], GROUP), *tensor.shape[2:])
 
 

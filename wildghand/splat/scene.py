@@ -87,7 +87,7 @@ def largest(tensor: torch.Tensor) -> torch.Tensor:
 def usable(
     scene: FlatScene, most: float, turns: tuple[float, float]
 ) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
-    """What can be drawn: (S, N) masks of each argument's Gaussians, and (I,) of the cameras.
+    """Find what can be drawn: (S, N) masks of each argument's Gaussians, and (I,) of the cameras.
 
     `most` is the largest length; the largest number of a quaternion lies between `turns`, the first
     excluded. Colours stay within `MAX_COLOR`, focal lengths are positive, all is finite.

@@ -91,7 +91,7 @@ def piece_count(count: int, piece: int) -> int:
 
 
 def run_pieces(kernel: Callable[..., Any], count: int, piece: int, work: int, *args: Any) -> None:
-    """Call a kernel of which job k is the things from `piece * k` on, at most `piece`."""
+    """Call a kernel whose job k does at most `piece` items, from item `piece * k`."""
     run_jobs(kernel, piece_count(count, piece), work, *args)
 
 

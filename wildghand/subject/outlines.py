@@ -222,7 +222,7 @@ class ComparedFrames:
         Args:
             posed: the hands.
             frame: row of the frame, from 0.
-            most: points at most, evenly spread over the outline.
+            most: largest number of points, evenly spread over the outline.
 
         Returns:
             Points away from the wrist.

@@ -25,7 +25,7 @@ _GAP = 8
 
 
 def live_sheet(look: Glance, aspect: float) -> np.ndarray:
-    """The three pictures of a glance on a sheet, (H, W, 3) uint8; W is `aspect` times H."""
+    """Draw the three pictures of a preview on a sheet, (H, W, 3) uint8; W is `aspect` times H."""
     names = (f"frame {look.frame}", f"avatar, {look.psnr:.1f} dB", "weights of pixels")
     pictures = (look.truth, look.avatar, np.repeat(look.weights[..., None], 3, axis=2))
     room = ((_GAP, _GAP), (_GAP, _GAP), (0, 0))

@@ -26,7 +26,7 @@ from wildghand.avatar.studio import HandAngles
 
 @dataclass(frozen=True, eq=False)
 class PageCamera:
-    """The camera of a page, as it was last told."""
+    """The camera of a page, as last reported."""
 
     #: (4,) (w, x, y, z), camera to world.
     wxyz: np.ndarray
@@ -111,7 +111,7 @@ class Motion:
         return self._capture.info.frame_count
 
     def hands(self, frame: int) -> dict[str, HandPose]:
-        """The hands of a frame, by side, in the poses that the avatar believes in."""
+        """The hands of a frame by side, in the avatar's corrected poses."""
         poses = self._avatar.believed(self._capture.hand_poses(frame))
         return {side: poses[side] for side in self._sides}
 

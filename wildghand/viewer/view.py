@@ -259,7 +259,7 @@ class Panel:
         self._text.content = f"{width} x {height} px, {kind}, {1e3 * seconds:.0f} ms"
 
     def show_angles(self) -> None:
-        """Bring the sliders to the hands as they are."""
+        """Set the sliders to the current angles of the hands."""
         for side, hand in self._view.hands.items():
             shown = shown_angles(hand, self._view.angles[side])
             for (of, joint, angle), slider in self._sliders.items():

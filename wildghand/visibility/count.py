@@ -35,7 +35,7 @@ def shown_frames(
 
     Args:
         visible: takes rows, (B,) int64 on the CPU, and returns how much each pixel of these frames
-            says of the hand, (B, H, W) in [0, 1].
+            shows the hand, (B, H, W) in [0, 1].
 
     Returns:
         (N,) by side, from 0 to R.
@@ -75,7 +75,7 @@ def never_shown(shown: Tensor, near: Tensor) -> Tensor:
 def seen_anchors(
     hands: Mapping[str, AnchorPoses], viewmats: Tensor, Ks: Tensor, size: torch.Size
 ) -> dict[str, tuple[Tensor, Tensor]]:
-    """Project anchors into B frames, and tell which of them neither hand hides.
+    """Project anchors into B frames, and find those that neither hand hides.
 
     Args:
         viewmats: (B, 4, 4) world to camera.

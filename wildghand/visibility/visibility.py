@@ -1,4 +1,4 @@
-"""Gaussians that are the more opaque discs on the skin, the less the frames say of them.
+"""Gaussians become opaque discs on the skin, the more so the less the frames show them.
 
 An offset from the skin moves a Gaussian along the line of sight too, where a single direction shows
 nothing of it; from elsewhere it is at the wrong place. Its shape is as uncertain. The maximum of a
@@ -141,7 +141,7 @@ class Visibility(Found):
         return replace(self, offsets=changed(self.offsets), shapes=changed(self.shapes))
 
     def to_tensors(self) -> dict[str, Tensor]:
-        """The shares, and whether a wall closes each wrist (1,), as an avatar keeps them."""
+        """The shares, and whether a cap closes each wrist (1,), as an avatar keeps them."""
         walls = {
             f"{_WALLS}{side}": shares.new_tensor([float(side not in self.open_wrists)])
             for side, shares in self.shapes.items()
@@ -181,7 +181,7 @@ def weigh_visibility(
 
 
 def kept_share(frames: Tensor, half: float) -> Tensor:
-    """The share n / (n + half) of what n frames say that outweighs a prior; ones without a prior.
+    """The weight n / (n + half) of n frames against a prior; ones without a prior.
 
     Args:
         frames: (N,) n of each Gaussian.

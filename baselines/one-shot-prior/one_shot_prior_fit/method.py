@@ -100,7 +100,7 @@ class OneShotModel:
     def colored(self, image: Tensor, coverage: Tensor) -> Tensor:
         """Gain and offset on every Gaussian's colour, (B, H, W, 3) sRGB over black.
 
-        Blending is linear in the colours, so that the image may be changed in their place.
+        Blending is linear in the colours, so the image is changed instead of them.
         """
         return image * self.gain + coverage * self.offset
 
@@ -114,7 +114,7 @@ class OneShotModel:
 
 @dataclass(frozen=True)
 class OneShotSettings(LoopSettings):
-    """How the frozen prior is bent to a person; weights of terms are the original's."""
+    """How the frozen prior is adapted to a person; the weights of terms are the original's."""
 
     #: Gaussians on each hand.
     gaussians: int = number(12_337, 1, 1_000_000)

@@ -75,9 +75,9 @@ class ScanSettings(LoopSettings):
 
 
 class ShadowNet(nn.Module):
-    """Three convolutions over the texture plane of some cells' edge; one sigmoid channel.
+    """Three convolutions over a square texture plane of `cells` cells; one sigmoid channel.
 
-    It sees some channels of what is known of each anchor in a frame.
+    Its input has `channels` values for each anchor in a frame.
     """
 
     coordinates: Tensor

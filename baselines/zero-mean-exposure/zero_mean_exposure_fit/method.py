@@ -168,7 +168,7 @@ class ZeroMeanExposureRecipe(PlainRecipe[ZeroMeanExposureSettings]):
         return DevelopedDrawing(develop(drawn.image, numbers), drawn.coverage, drawn.image)
 
     def loss(self, batch: Batch, drawing: Drawing, weights: torch.Tensor) -> torch.Tensor:
-        """The plain fit's, and the controller's: it learns the numbers that frames have by now."""
+        """The plain fit's loss, and that of the controller, which learns the frames' numbers."""
         assert isinstance(drawing, DevelopedDrawing)
         loss = super().loss(batch, drawing, weights)
         self._seen[batch.rows.to(self.device)] = shrink(drawing.radiance)

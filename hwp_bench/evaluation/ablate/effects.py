@@ -47,8 +47,8 @@ _GROUPS = ("single", "interacting", "macro")
 class ScoreEffect(Contrast):
     """An effect in one metric and scope.
 
-    Score with the component less score without it; for interactions, what both together add to
-    the sum of what each adds without the other.
+    Score with the component less score without it. For interactions: the gain of both together less
+    the sum of their gains alone.
     """
 
     effect: str
@@ -96,7 +96,7 @@ def score_effects(
 
 
 def seconds(capture: CaptureResult, quantity: str) -> float | None:
-    """Return a time of one capture in seconds; None where the method does not say."""
+    """Return a time of one capture in seconds; None where the method reports none."""
     spent, units = {
         "step": (capture.fit_seconds, capture.steps),
         "fit": (capture.fit_seconds, 1),
@@ -108,7 +108,7 @@ def seconds(capture: CaptureResult, quantity: str) -> float | None:
 def cost_effects(ablation: AblationRuns) -> list[CostEffect]:
     """Return the cost of every component, as ratios paired by capture and seed.
 
-    Captures on which a variant says nothing of its time are left out.
+    Captures without a recorded time are left out.
     """
     found = []
     effects = ablation.design.effects
@@ -176,8 +176,8 @@ def ablation_tables(
 ) -> dict[str, Table]:
     """Return every table of an ablation, by name.
 
-    `ablation` (a row a variant: the paper's columns, and the time), `perturbations` (its scores by
-    perturbation), `paper` (as `ablation`, in the protocol paper-wildghand), `gains` (a row an
+    `ablation` (a row per variant: the paper's columns, and the time), `perturbations` (scores by
+    perturbation), `paper` (as `ablation`, in the protocol paper-wildghand), `gains` (a row per
     effect, in PSNR), `effects`, `effects_perturbations`, `component_cost`, `seeds`, `seconds`
     (where those of all runs went).
     """
@@ -202,7 +202,7 @@ def ablation_tables(
 
 
 def variant_table(ablation: AblationRuns, metrics: Sequence[str]) -> Table:
-    """Return one row a variant: what is in it, mean scores over seeds, and what it took."""
+    """Return one row per variant: its components, mean scores over seeds, and its cost."""
     runs = list(ablation.runs.values())
     columns = [
         *_component_columns(ablation),
@@ -245,7 +245,7 @@ def base_text(ablation: AblationRuns) -> str:
 
 
 def perturbation_table(ablation: AblationRuns, metrics: Sequence[str]) -> Table:
-    """Return one row a variant: its scores by perturbation, means over seeds."""
+    """Return one row per variant: its scores by perturbation, means over seeds."""
     columns = [
         *_component_columns(ablation),
         *_score_columns(ablation, metrics[:3], PERTURBATIONS),
@@ -313,7 +313,7 @@ def _kinds_note(effects: Sequence[ScoreEffect]) -> str:
 
 
 def gain_table(effects: Sequence[ScoreEffect]) -> Table:
-    """Return one row an effect, and a group of columns for each scope: gain and interval.
+    """Return one row per effect, and a group of columns for each scope: gain and interval.
 
     All effects are in one metric.
     """
@@ -340,7 +340,7 @@ def gain_table(effects: Sequence[ScoreEffect]) -> Table:
 
 
 def effect_table(effects: Sequence[ScoreEffect]) -> Table:
-    """Return one row an effect, metric and scope."""
+    """Return one row per effect, metric and scope."""
     columns: list[Filled] = [
         (Column("Effect"), [item.effect for item in effects]),
         (Column("Kind"), [item.kind for item in effects]),
@@ -358,7 +358,7 @@ def effect_table(effects: Sequence[ScoreEffect]) -> Table:
 
 
 def cost_table(costs: Sequence[CostEffect]) -> Table:
-    """Return one row a component and quantity."""
+    """Return one row per component and quantity."""
     columns: list[Filled] = [
         (Column("Component"), [item.effect for item in costs]),
         (Column("Of a"), [QUANTITIES[item.quantity] for item in costs]),
@@ -377,7 +377,7 @@ def cost_table(costs: Sequence[CostEffect]) -> Table:
 
 
 def seed_table(ablation: AblationRuns, metrics: Sequence[str]) -> Table:
-    """Return one row a variant: the spread of the macro means over seeds."""
+    """Return one row per variant: the spread of the macro means over seeds."""
     columns: list[Filled] = [(Column("Variant"), list(ablation.runs))]
     for metric in metrics:
         facts = metric_facts(metric)

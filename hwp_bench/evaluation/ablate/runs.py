@@ -238,7 +238,7 @@ def run_ablation(
     on_job: OnCapture | None = None,
     **how: Unpack[How],
 ) -> AblationRuns:
-    """Run an ablation; what is on disk from an earlier start is taken as it is, and said.
+    """Run an ablation; results of an earlier start are kept and listed.
 
     Results of other settings are refused, or stay until all new ones are whole.
 

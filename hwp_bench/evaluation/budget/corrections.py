@@ -1,8 +1,8 @@
-"""Corrections of a predicted frame that only its truth can tell: oracles at test time.
+"""Corrections of a predicted frame that only its truth can give: oracles at test time.
 
-Each takes away what a few numbers can of one kind of error: light as a gain of linear light,
-place as a motion of the image, pose as a motion of the posed surface. What a correction gains is
-what that kind of error costs. The parameters are found by Gauss-Newton steps on the squared error
+Each removes as much of one kind of error as a few numbers can: light as a gain of linear light,
+place as a motion of the image, pose as a motion of the posed surface. The gain of a correction is
+the cost of that kind of error. The parameters are found by Gauss-Newton steps on the squared error
 in sRGB, which PSNR counts.
 """
 
@@ -136,7 +136,8 @@ def pose(pair: Pair) -> np.ndarray:
 
     Every joint turns and every hand is displaced. A parameter moves by its own scale
     (`MovingSurface.scales`) only where that takes away 1 % of the squared error: a joint that the
-    image does not tell stays still, and pixels that nothing moves right are left to other rows.
+    image does not determine stays still, and pixels that nothing moves right are left to other
+    rows.
     """
     surface = pair.surface
     if surface is None:

@@ -144,7 +144,7 @@ class MovingSurface:
         return (here + ways[self._nearest]).astype(np.float32)
 
     def moves(self, change: np.ndarray, region: np.ndarray) -> np.ndarray:
-        """How far the surface at some pixels goes by a unit of each number, near a change."""
+        """Derivatives of the surface's places at some pixels by each number, near a change."""
         self._draw(change)
         count = len(self.scales)
         if self._inside is None:

@@ -45,7 +45,7 @@ _TRUTH = re.compile(r"frame(\d{1,7})_view\d{1,7}_gt\.png")
 
 @dataclass
 class RenderedImport:
-    """What became of the frames of one capture."""
+    """The outcome of importing the frames of one capture."""
 
     #: Id of the capture.
     capture: str
@@ -94,12 +94,12 @@ def import_rendered(
     name: str = "authors-code",
     overwrite: bool = False,
 ) -> RenderedImport:
-    """Make predictions of a capture of what the authors' code has drawn.
+    """Make predictions for a capture from renderings of the authors' code.
 
     Args:
         folder: their experiment's folder, or one in it down to `render`.
         capture: the frames' positions in it are those of `output.pkl`.
-        split: tells which frames are wanted.
+        split: which frames are wanted.
         out: a method directory of predictions; captures are added to one that is there.
         name: of the method.
         overwrite: replace the capture's predictions in it.

@@ -6,9 +6,9 @@ that is seen most, so that every reader of version 1 reads it.
 
 A tracker may change its mind where hands cross or one comes back from behind the other. Every
 frame has two possible assignments of its hands to the sides. The cheapest sequence of them is
-found by dynamic programming (Viterbi, 1967): a hand is expected where it was, moved on with its
-speed, and costs what the network's vote for the other side says. Where hands lie on each other the
-votes decide, and where single votes err the motion does.
+found by dynamic programming (Viterbi, 1967): a hand is expected to move with constant speed, and a
+vote of the network for the other side has a cost. Where hands overlap the votes decide, and where
+single votes are wrong the motion does.
 """
 
 from __future__ import annotations
@@ -173,7 +173,7 @@ class Association:
 
     @property
     def sides(self) -> tuple[str, ...]:
-        """Sides of the hands, seen most first; without a second one that is hardly ever seen."""
+        """Sides of the hands, the one seen most first; a second one must be seen often enough."""
         counts = [int(self.tracks.seen(hand).sum()) for hand in range(len(self.tracks.score))]
         if len(counts) == 1:
             return (self.tracks.side(0),)
@@ -289,7 +289,7 @@ def _moved(path: _Path, cost: float, shown: list[tuple[int, np.ndarray]], frame:
 
 
 def read_association(path: str | os.PathLike[str]) -> Association | None:
-    """Read the hands of a file and associate them; None for a file that says nothing of sides."""
+    """Read the hands of a file and associate them; None for a file without sides."""
     tracks = read_hand_tracks(path)
     return None if tracks is None else associate(tracks)
 

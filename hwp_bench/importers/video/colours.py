@@ -292,7 +292,7 @@ def _to_xyz(primaries: tuple[tuple[float, float], ...]) -> np.ndarray:
 
 @helper
 def _nearest(table: np.ndarray, place: float) -> float:
-    """A table's value at the nearest entry to a place in [0, 1]; outside, that of its ends."""
+    """Look up the entry of a table nearest to a place in [0, 1]; places outside get its ends."""
     last = len(table) - 1
     if not place > 0.0:
         return table[0]

@@ -108,7 +108,7 @@ class VideoInfo:
 
 @dataclass(frozen=True)
 class Reading:
-    """What came of reading a video to its end."""
+    """The outcome of reading a video to its end."""
 
     #: Number of frames that were decoded.
     frames: int
@@ -267,7 +267,7 @@ def read_frames(
     """Decode the selected frames: yields the index in the video, and (H, W, 3) uint8 sRGB.
 
     Those between are decoded and dropped, because seeking is not exact in every container. `ended`
-    is told what came of it when the video was read to its end, which a `stop` prevents.
+    gets the outcome when the video was read to its end, which a `stop` prevents.
     """
     with _opened(info.path) as video:
         index = 0
@@ -402,7 +402,7 @@ class _Video:
         return self._known[key]
 
     def reading(self) -> Reading:
-        """Say what came of it, after the last frame."""
+        """Print the result after the last frame."""
         # Where no length is stated, a damaged frame among the last is the sign of an end.
         cut = self._cut or (self._rows and self._damaged_at > self.decoded - _TAIL)
         if self._packets is not None:
@@ -455,7 +455,7 @@ class _Video:
 
 
 def _expected(container: Any, stream: Any, kind: str) -> tuple[int | None, float | None, bool]:
-    """Read what a file says of its end."""
+    """Read the length that a file states."""
     if kind == "MP4 or MOV" and stream.frames > 0:
         # What an edit list leaves out is not among them.
         return len(stream.index_entries), None, True

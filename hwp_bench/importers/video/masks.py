@@ -1,9 +1,9 @@
 """Masks of the visible hands: the user's own, or graph cuts that the fit as it is now prompts.
 
 No network: the colours of hands and surroundings are learnt once over the whole clip, and the
-projected meshes say where to look. Skin before skin has no edge that a graph cut finds, so that two
-hands are cut out together. What belongs to which hand comes from the fitted meshes: of two that
-cover a pixel, the nearer one is seen.
+projected meshes say where to look. A graph cut finds no edge between two overlapping hands, so two
+hands are cut out together. The fitted meshes decide which pixel shows which hand: of two that cover
+a pixel, the nearer one is seen.
 """
 
 from __future__ import annotations

@@ -346,7 +346,7 @@ class SurfaceResidual(ABC):
 
     @abstractmethod
     def differences(self, frame: int, drawn: Drawn) -> Differences | None:
-        """Compare a frame with what was collected; None if it says nothing."""
+        """Compare a frame with the collected texture; None if it shows too little."""
 
     def draw(self, vertices: np.ndarray, pixels: np.ndarray) -> Drawn:
         """Draw the mesh of a frame in its image."""
@@ -475,7 +475,7 @@ class PictureView:
 class TextureResidual(SurfaceResidual):
     """Difference of each frame from the mean texture of all frames.
 
-    An outline cannot tell how a finger is turned about its axis, or a palm about an axis in the
+    An outline does not show how a finger is turned about its axis, or a palm about an axis in the
     image; wrinkles, nails and veins can.
     """
 
@@ -564,7 +564,7 @@ class TextureResidual(SurfaceResidual):
         return Differences(drawn.face[core], drawn.mix[core], *columns, trust)
 
     def _without_light(self, values: np.ndarray, region: np.ndarray) -> np.ndarray:
-        """Subtract what changes over the breadth of light; zero outside of the region."""
+        """Subtract slow changes, which are those of light; zero outside of the region."""
         light = smooth_within(values, region, self._LIGHT_BREADTH * self._size)
         return np.where(region, values - light, 0.0).astype(np.float32)
 

@@ -1,10 +1,10 @@
 """The inputs of a video import: what a person chooses, what is read, and whether it fits together.
 
 Landmarks of another convention are numbers like all others: a fit to them runs for minutes and
-follows no frame. Three things tell beforehand. The joints of a hand are near each other along its
-fingers, in one order only. Its landmarks in the image look like its landmarks in space, seen from
-the front. And skin has other colours than what is around it, so that landmarks that lie on a hand
-separate the colours on them from those around them better than any that lie elsewhere.
+follows no frame. Three checks find it beforehand. The joints of a hand are near each other along
+its fingers, in one order only. Its landmarks in the image look like its landmarks in space, seen
+from the front. And skin has other colours than what is around it, so that landmarks that lie on a
+hand separate the colours on them from those around them better than any that lie elsewhere.
 """
 
 from __future__ import annotations
@@ -334,7 +334,7 @@ def refuse_other_units(source: VideoSource) -> None:
 
 
 def landmark_doubts(source: VideoSource) -> tuple[str, ...]:
-    """Say what the numbers and the pictures tell against landmarks; nothing if all is well."""
+    """List what the numbers and pictures show to be wrong with landmarks; empty if all is well."""
     found: list[str] = []
     for landmarks in source.hands.values():
         order = doubts_of_order(landmarks)
@@ -346,7 +346,7 @@ def landmark_doubts(source: VideoSource) -> tuple[str, ...]:
 
 
 def doubts_of_order(landmarks: Landmarks) -> list[str]:
-    """Say which order of joints makes a hand's bones shorter than ours makes them."""
+    """Name an order of joints that makes the hand's bones shorter than ours does, if any."""
     found: dict[str, list[str]] = {}
     for name in ("image", "world"):
         points = getattr(landmarks, name)[landmarks.detected]
@@ -383,7 +383,7 @@ def doubts_of_axes(landmarks: Landmarks, which: str = "`image` or `world`") -> l
 
 
 def _doubts_of_pictures(source: VideoSource, landmarks: Landmarks) -> tuple[list[str], bool]:
-    """Say where a hand's landmarks would lie on it, and whether that is where they are."""
+    """List the reasons to doubt that a hand's landmarks lie on it."""
     width, height = source.video.width, source.video.height
     places: dict[str, _Move] = {
         "x and y of `image` are exchanged": lambda p: p[..., ::-1],
@@ -444,7 +444,7 @@ def _pictures(source: VideoSource, landmarks: Landmarks) -> tuple[list[int], lis
 
 
 def _separation(pictures: Sequence[np.ndarray], points: np.ndarray) -> float:
-    """How well a line through colours tells those on (F, 21, 2) px from those around them.
+    """How well a plane in colour space separates colours at (F, 21, 2) px from others nearby.
 
     Mean probability over the frames that a colour on the hand lies on its side of one around it:
     0.5 by chance, 1 where all do.
@@ -493,7 +493,7 @@ def refuse_unfitted(
     """Refuse a fit that follows (nearly) no frame of a hand, with what is likely wrong.
 
     `fitted` are (F,) bool by side, frames in which the hand model follows the landmarks; `doubts`
-    what tells against them.
+    are reasons to distrust them.
     """
     for side, good in fitted.items():
         seen = source.hands[side].detected

@@ -1,6 +1,6 @@
-"""Whether a tracked video can become an avatar: told after tracking, before minutes of import.
+"""Whether a tracked video can become an avatar: checked after tracking, before minutes of import.
 
-What tells is measured in frames: the size of the hand, whether it is cut off, how far it moves, its
+The checks count frames: the size of the hand, whether it is cut off, how far it moves, its
 exposure, its colour, and whether something is drawn over it. A fault in a tenth of the frames
 that show the hand is reported, one in most of them leaves nothing that an avatar could be made of.
 """

@@ -78,7 +78,7 @@ class Engine:
         pass
 
     def run(self, jobs: Sequence[Job], on_done: OnDone, on_start: OnStart | None = None) -> None:
-        """Run jobs; each result is in its folder before `on_done` hears of it."""
+        """Run jobs; each result is in its folder before `on_done` is called."""
         raise NotImplementedError
 
 
@@ -96,7 +96,7 @@ class LocalEngine(Engine):
 
 
 def ignore_progress(done: int, total: int) -> None:
-    """Be told the steps of a job that nobody watches."""
+    """Ignore the progress of a job that is not shown."""
 
 
 def raise_first(errors: Sequence[HwpError], count: int) -> None:

@@ -57,11 +57,11 @@ _ETC = (
 _SYS = ("bus", "class", "dev", "devices", "fs/cgroup", "kernel/mm", "module")
 _DEVICES = ("null", "zero", "full", "random", "urandom")
 _ACCELERATORS = ("nvidia*", "dri", "kfd")
-# What the walls give in part must not be opened whole by a word on the command line.
+# What the sandbox shows in part must not be opened whole by a word on the command line.
 _NEVER_EXPOSED = ("/", "/dev", "/dev/shm")
 _NEVER_FROM = ("/proc", "/sys")
 _MOST_LINKS = 40
-#: Folders inside the output of a run: its cache, and its home inside the walls.
+#: Folders inside the output of a run: its cache, and its home inside the sandbox.
 CACHE, HOME = "cache", "home"
 #: As `hwp_bench.base.kernels.KEPT`, which needs numba.
 KEPT_KERNELS = "HWP_KEPT_KERNELS"

@@ -1,8 +1,8 @@
 """Start an untrusted program in its sandbox, watch its time and memory, and end all of it.
 
-Where this user may make a memory control group, the kernel counts and enforces. Everywhere else
-the memory is measured, from outside and several times a second: what processes hold, and what no
-process need hold, which are files of the scratch folders, memory files and shared mappings.
+Where this user may make a memory control group, the kernel counts and enforces. Elsewhere memory is
+measured from outside, several times a second: that of processes, and that of files in scratch
+folders, memory files and shared mappings, which may outlive them.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Program:
     places: Sequence[Place] | None
     #: File that takes what it prints.
     log: Path
-    #: Whether files that exist in memory alone can be made inside the walls; drivers of
+    #: Whether files that exist in memory alone can be made inside the sandbox; drivers of
     #: accelerators may need them.
     memory_files: bool = False
 
@@ -160,7 +160,7 @@ def run_confined(
 
 
 def _unseen(word: str) -> str:
-    """What may be wrong with a program that cannot be started inside the walls."""
+    """What may be wrong with a program that cannot be started inside the sandbox."""
     leads = ""
     with contextlib.suppress(OSError):  # links of the process table are closed to most
         real = os.path.realpath(word)
@@ -335,7 +335,7 @@ def kernel_kills() -> int:
 
 
 def _kills(table: str | Path) -> int:
-    """The kills for want of memory that a table of the kernel counts; 0 where it tells none."""
+    """The kills for want of memory in a table of the kernel; 0 where it has no count."""
     with contextlib.suppress(OSError, ValueError), open(table) as lines:
         for line in lines:
             name, _, count = line.partition(" ")

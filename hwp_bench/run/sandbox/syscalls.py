@@ -81,7 +81,7 @@ _NOT_THERE = (
     *("clone3", "openat2", "io_uring_setup", "io_uring_enter", "io_uring_register"),
     *("userfaultfd", "bpf", "perf_event_open"),
 )
-#: Refused whole: what would change the walls, or take the processor from everything else.
+#: Refused whole: what would change the sandbox, or take the processor from everything else.
 _FORBIDDEN = (
     *("mount", "umount2", "pivot_root", "open_tree", "open_tree_attr", "move_mount"),
     *("fsopen", "fsconfig", "fsmount", "fspick", "mount_setattr"),

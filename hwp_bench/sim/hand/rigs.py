@@ -96,7 +96,7 @@ def cut(mesh: RigMesh, height: np.ndarray) -> RigMesh:
 def _split(
     faces: np.ndarray, heights: np.ndarray, sign: np.ndarray, count: int
 ) -> tuple[np.ndarray, dict[tuple[int, int], float]]:
-    """The parts of faces above zero, and the share of the way of new points on crossed edges."""
+    """Cut faces at zero: the parts above, and the fractions of the edges where new points lie."""
     shares: dict[tuple[int, int], float] = {}
     index: dict[tuple[int, int], int] = {}
     parts: list[list[int]] = []
@@ -343,7 +343,7 @@ def side_of_name(name: str) -> str | None:
 
 
 def hand_joints(names: list[str], wanted: str, where: str) -> tuple[list[int], str | None]:
-    """Rows in `names` of the hand model's 16 joints, and the side that the names tell, if any."""
+    """Rows in `names` of the hand model's 16 joints, and the side that the names state, if any."""
     best: list[int | None] = [None] * len(WEBXR)
     told: str | None = None
     sides = {side_of_name(name) for name in names}

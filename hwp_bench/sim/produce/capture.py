@@ -108,7 +108,7 @@ class RenderRequest:
     size: int | None = None
     #: Seed; the scene's own if None.
     seed: int | None = None
-    #: Processes of one render; as many as are worth it if None.
+    #: Processes of one render; as many as help if None.
     workers: int | None = None
     #: Whether linear layers are stored too.
     exr: bool = False
@@ -210,7 +210,7 @@ def render_capture(
         frame_count: frames over which the scene is spread; the scene's own if None.
         size: edge of the square image in pixels.
         seed: replaces the scene's seed.
-        workers: processes; as many as are worth it if None.
+        workers: processes; as many as help if None.
         overwrite: replace an existing folder.
         exr: also store linear light, depth, normals, object ids and motion of every frame as
             OpenEXR, under `extra/`.
@@ -512,7 +512,7 @@ class SuiteItem:
 
     @property
     def shows(self) -> str:
-        """Title of the scene, one line for people."""
+        """Title of the scene."""
         return self.scene.title
 
     @property
@@ -664,7 +664,7 @@ def _folder(item: SuiteItem, cache: str | os.PathLike[str] | None) -> Path:
 def workers_each(workers: int | None, engine: Engine, needs: Needs) -> int | None:
     """The processes of one render: as asked for, else as many as the engine allows.
 
-    In turn each render takes as many as are worth it; where several run at once, the processors
+    In turn each render takes as many as help; where several run at once, the processors
     of a job.
     """
     return workers if workers is not None or engine.in_turn else max(1, int(needs.cpus))

@@ -2,9 +2,9 @@
 
 Hands of a tracker are those that a fit to its landmarks gives. Landmarks err as measured, and the
 fit answers to first order: the parameters move by what explains the wrong landmarks best, next to
-a prior. So errors are large where the landmarks say little, such as in fists and along the line of
-sight, and the joints of a finger make up for each other as they do in a real fit, which keeps the
-hand on its image.
+a prior. So errors are large where the landmarks constrain little, such as in fists and along the
+line of sight, and the joints of a finger make up for each other as they do in a real fit, which
+keeps the hand on its image.
 
 All numbers of that noise are printed by `python -m benchmarks.tracker_errors --video VIDEO
 --landmarks NPZ` on a video of 621 frames with MediaPipe's landmarks. There is no truth in it: what

@@ -197,7 +197,7 @@ Cover = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 @dataclass(frozen=True, eq=False)
 class Canvas:
-    """The picture of a moment."""
+    """The picture at one moment."""
 
     #: (H, W, 3) linear, is painted on.
     image: np.ndarray
@@ -311,7 +311,7 @@ class OtherArm:
     seed: Seed = 0
 
     def draw(self, canvas: Canvas) -> None:
-        """Draw the arm of a moment."""
+        """Draw the arm at one moment."""
         color = srgb_to_linear(skin_color(canvas.tone if self.tone is None else self.tone))
         rng = generator(self.seed, "other arm")
         phases = rng.uniform(0.0, 2.0 * np.pi, 3)
@@ -508,7 +508,7 @@ class Face:
     sway: float = number(0.12, 0.0, 1.0)
 
     def draw(self, canvas: Canvas) -> None:
-        """Draw the face of a moment."""
+        """Draw the face at one moment."""
         import cv2
 
         rng = generator(self.seed, "face moves")

@@ -57,7 +57,7 @@ class Looks:
                 if item.side in (side, "both")
             ]
             if len(set(worn)) != len(worn):
-                raise UsageError("a hand wears two", field=name)
+                raise UsageError("has more than one for the same hand", field=name)
 
     def on(self, side: str) -> Looks:
         """The looks of one hand; hands that look alike give equal looks and share one painting."""
@@ -115,7 +115,7 @@ class Subject:
 
 
 def without_defaults(record: Any, keep: tuple[str, ...] = ()) -> dict[str, Any]:
-    """A record as JSON values, without fields that say what they say by default."""
+    """A record as JSON values, without fields that have their default."""
     said = [item for item in fields(record) if getattr(record, item.name) != item.default]
     wanted = {*keep, *(item.name for item in said)}
     return {name: value for name, value in asdict(record).items() if name in wanted}

@@ -124,7 +124,7 @@ def test_the_field_has_the_means_and_differences_of_the_entries(checkout: Path) 
     assert cells(page, "Trimmed")[4] == "ahead"
     assert "The end.\n" in page
     assert "3 of the 15 methods that ship are complete here" in page
-    assert "**A part of the field**: no complete run of " in page
+    assert "**Incomplete**: no complete run of " in page
     # 28.5 dB against 30.2 on the last capture; one dB ahead elsewhere.
     assert "on 1 of 8 captures: capture7 (-1.70 dB, Plain)" in page
     assert "- **Seeds**: 0, 1\n" in page
@@ -262,7 +262,7 @@ def test_a_wrong_place_and_a_wrong_block_are_refused(tmp_path: Path, checkout: P
 
 def test_a_verdict_follows_the_interval() -> None:
 
-    told = {(0.1, 2.0): "ahead", (-2.0, -0.1): "behind", (-0.1, 0.1): "not told apart"}
+    told = {(0.1, 2.0): "ahead", (-2.0, -0.1): "behind", (-0.1, 0.1): "not significant"}
     for (low, high), text in told.items():
         assert verdict_of(Estimate((low + high) / 2, low, high, None, None, None, 8)) == text
     assert verdict_of(None) is None

@@ -186,7 +186,16 @@ def test_the_entry_s_own_results_are_rescored(made, tmp_path: Path, capsys) -> N
     file, capture = made
     entry = make_entry(read_results(file))
     write_entry(tmp_path / "entries", entry)
-    words = ["leaderboard", "confirm", str(file), "--checked-by", "us", "--capture", str(capture)]
+    words = [
+        "dev",
+        "leaderboard",
+        "confirm",
+        str(file),
+        "--checked-by",
+        "us",
+        "--capture",
+        str(capture),
+    ]
     words += ["--entries", str(tmp_path / "entries")]
     capsys.readouterr()
     assert main([*words, "--json"]) == 0

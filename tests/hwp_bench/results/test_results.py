@@ -1,6 +1,6 @@
 """The result file: what is written is read, and what is edited badly is named.
 
-Runs without walls are named on the console and below tables. Oracle: the made results.
+Runs without a sandbox are named on the console and below tables. Oracle: the made results.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ def test_the_console_says_the_level_on_every_run(tmp_path: Path) -> None:
 @pytest.mark.parametrize("isolation", ["processes", "processes (mount of /usr: refused)"])
 def test_every_table_names_methods_that_ran_without_walls(isolation: str) -> None:
     walled, bare = _made("namespaces", "honest"), _made(isolation, "bare")
-    note = "Run without walls, where test frames can be read: Bare."
+    note = "Run without a sandbox, where test frames can be read: Bare."
     for table in all_tables([walled, bare]).values():
         assert table.notes.count(note) == 1
         assert note in to_markdown(table)

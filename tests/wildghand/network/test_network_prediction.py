@@ -329,12 +329,12 @@ def test_the_table_leaves_nothing_out(size: str) -> None:
 
 @pytest.mark.parametrize("size", ["compact", "paper"])
 def test_the_command_prints_the_table(size: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["info", "--network", size, "--json"]) == 0
+    assert main(["network", size, "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert facts["settings"]["size"] == size
     assert facts["total"] == sum(row["parameters"] for row in facts["layers"])
     assert facts["total"] == sum(facts["parts"].values())
-    assert main(["info", "--network", size]) == 0
+    assert main(["network", size]) == 0
     assert f"{facts['total']:,}" in capsys.readouterr().out
 
 

@@ -67,7 +67,7 @@ from wildghand.splat.kernels.vectors import (
 
 
 class TileScene(NamedTuple):
-    """What both passes read: splats, and which of them each tile blends."""
+    """Input of both passes: splats, and which of them each tile blends."""
 
     start: np.ndarray  # (tiles + 1,) int64, where the list of each tile starts
     entries: np.ndarray  # (E,) uint64, see `lists.fill_tiles`
