@@ -204,7 +204,7 @@ make_avatar(folder / "hand.avi", out, choices(folder))
     [
         ("import", 1, "Importing the hand once more: the last run was stopped there."),
         ("between", 2, "Done before and kept: track, import."),
-        ("fit", 2, "Going on after 3 steps."),
+        ("fit", 2, "Continuing after 3 steps."),
         ("turntable", 4, "Drawing the turntable once more: the last run was stopped there."),
     ],
 )
