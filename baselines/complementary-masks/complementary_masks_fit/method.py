@@ -31,7 +31,7 @@ class ComplementaryMasksSettings(FitSettings):
     #: Superpixels of a frame, about; the hard mask leaves out whole ones.
     superpixels: int = number(60, 1, 10_000)
     #: Share of the hand's pixels whose error is high; of unlike patches it is twice as many.
-    high_share: float = number(0.05, 0.0, 0.5)
+    high_share: float = number(0.02, 0.0, 0.5)
 
 
 def find_hard(

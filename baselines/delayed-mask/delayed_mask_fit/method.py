@@ -51,7 +51,7 @@ class DelayedMaskSettings(FitSettings):
     #: schedule of RobustSplat, whose Gaussians do not grow in number before.
     shape_from: float = number(0.0, 0.0, 1.0)
     #: By how much what is left out grows on all sides, px.
-    margin: int = number(1, 0, 64)
+    margin: int = number(3, 0, 64)
     #: Adam step of the network; it does not fall.
     mask_rate: float = 0.03
 

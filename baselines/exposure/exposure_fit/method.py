@@ -74,7 +74,7 @@ class ExposureSettings(FitSettings):
     #: Moments of an exposure at which the hand is drawn.
     moments: int = number(5, 2, 64)
     #: How long the shutter is open at the start, as a share of the time between two frames.
-    shutter: float = number(0.25, 0.0, 2.0)
+    shutter: float = number(0.1, 0.0, 2.0)
     #: Motion of the hand during the exposure under which a frame is taken for sharp, px.
     least_motion: float = number(1.5, 0.0, 1e6)
     #: Adam step of the two ends' poses, rad.

@@ -126,7 +126,7 @@ class OneShotSettings(LoopSettings):
     #: 75 % of the budget (`halving`, the original's).
     decay: str = choice("geometric", "halving")
     #: Adam step of the identity map; the original's is 0.01.
-    identity_rate: float = number(0.03)
+    identity_rate: float = number(0.1)
     #: Adam step of the bias of the texture plane.
     bias_rate: float = number(0.01)
     #: Adam step of gain and offset.

@@ -53,7 +53,7 @@ class ScanSettings(LoopSettings):
     #: Adam step of the skin's colour in stage 1.
     color_rate: float = 0.01
     #: Adam step of the shadow network's weights.
-    shadow_rate: float = 3e-3
+    shadow_rate: float = 0.01
     #: Adam step of the texels.
     texture_rate: float = 0.01
     #: Standard deviation of a Gaussian along the surface, in units of the anchors' spacing.

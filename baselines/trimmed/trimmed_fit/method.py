@@ -52,7 +52,7 @@ class TrimmedSettings(FitSettings):
     #: Whether the inner 8 x 8 px of a patch of 16 x 16 px count if most of the patch does.
     patch: bool = True
     #: Steps of the published schedule that the whole fit stands for; 0 trims from the start.
-    schedule_steps: float = number(3_000.0, 0.0, 1e9)
+    schedule_steps: float = number(30_000.0, 0.0, 1e9)
     #: `vote`: share of errors below which a pixel is surely an inlier.
     sure_inlier: float = number(0.5, 0.0, 1.0)
     #: `vote`: share of errors above which a pixel is surely an outlier.

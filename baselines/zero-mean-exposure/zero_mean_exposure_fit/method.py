@@ -35,7 +35,7 @@ class ZeroMeanExposureSettings(FitSettings):
     """Settings of the plain fit, and how frames' numbers and the controller are fitted."""
 
     #: Adam step of the frames' numbers.
-    frame_rate: float = 0.03
+    frame_rate: float = 0.01
     #: Adam step of the controller; it does not fall.
     controller_rate: float = 0.01
     #: Share of the fit before the controller learns; 1: unseen frames have the mean of all.
