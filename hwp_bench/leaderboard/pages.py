@@ -45,7 +45,7 @@ TYPED = "docs/results.toml"
 #: Where pictures of blocks lie; their names end in a digest of what they show.
 PICTURES = "docs/pictures/field"
 
-_BLOCK = re.compile(r"^<!-- results: (.+) -->\n(.*?)^<!-- end -->$", re.DOTALL | re.MULTILINE)
+_BLOCK = re.compile(r"^<!-- results: ([^\n]+) -->\n(.*?)^<!-- end -->$", re.DOTALL | re.MULTILINE)
 _DIGEST = re.compile(r"<!-- digest: \w{64} -->\s*\Z")
 _DECIBELS = re.compile(r"[-+]?\d[\d.]*(?:(?:,| to| and| or)\s[-+]?\d[\d.]*)*\s+dB\b")
 _STUDY = re.compile(r"\]\((?:\.\./)*(?:docs/)?studies/([\w-]+\.md)")

@@ -62,6 +62,10 @@ def field_results():
     return made
 
 
+# Methods whose tables share a page.
+TWO = ("wild", "plain")
+
+
 @pytest.fixture(scope="module")
 def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A checkout with entries, pages whose blocks are empty, and logs of benchmarks."""
@@ -71,6 +75,7 @@ def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "README.md": "<!-- results: headline -->\n<!-- end -->\n",
         "docs/field.md": "# The field\n\n<!-- results: field -->\n<!-- end -->\n\nThe end.\n",
         "baselines/wild/README.md": "<!-- results: tuning wild -->\nold\n<!-- end -->\n",
+        "docs/two.md": "\n".join(f"<!-- results: tuning {a} -->\n<!-- end -->" for a in TWO),
         "docs/results.toml": TYPED,
         "docs/video.md": "<!-- results: stages -->\n<!-- end -->\n",
         "docs/studies/one.md": "It brings 2.5 dB.\n",
@@ -175,6 +180,10 @@ def test_trials_have_means_next_to_the_plain_fit(checkout: Path) -> None:
     assert cells(page, "the plain fit") == ["the plain fit", "10.00", "12.00", "11.00"]
     assert "Commit, day, machine: c, 2026-01-02, m." in page
     assert "old" not in page
+    both = (checkout / "docs" / "two.md").read_text()
+    assert cells(both, "rate=1 |") == ["rate=1", "12.00", "–", "–"]
+    assert both.count("<!-- end -->") == 2
+    assert both.index("rate=3") < both.index("<!-- results: tuning plain -->")
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/field.md", "baselines/wild/README.md"])
