@@ -403,19 +403,20 @@ class _Turns:
             seen = [] if kinds == ("outline",) else projected.coverage(masks.coverage)
             for hand, (fitted, tracked) in enumerate(zip(self._fits, self._landmarks, strict=True)):
                 size, windows = tracked.hand_size, source.windows
-                residuals: list[OutlineResidual | SurfaceResidual] = []
+                outline: OutlineResidual | None = None
+                surface: SurfaceResidual | None = None
                 if "outline" in kinds:
                     # Where the other hand is, the masks' outline is not this one's.
                     ignored = projected.covered(hand, REACH * size * FIELD_SIZE / windows.side)
-                    residuals.append(
-                        OutlineResidual(masks.fields, tracked.detected, windows, size, ignored)
+                    outline = OutlineResidual(
+                        masks.fields, tracked.detected, windows, size, ignored
                     )
                 if seen:
                     other = seen[1 - hand] if len(seen) == 2 else None
                     shown = source.images.frames, seen[hand], tracked.detected, windows, size, other
                     kind = TextureResidual if "texture" in kinds else PictureResidual
-                    residuals.append(kind(HandPictures(*shown), fitted.model))
-                refine(fitted, *residuals, tick=step)
+                    surface = kind(HandPictures(*shown), fitted.model)
+                refine(fitted, outline, surface, tick=step)
 
 
 def _check_output(out: Path, options: VideoImport) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -14,8 +15,8 @@ from hwp_bench.hands.skeleton import moved_joints
 from hwp_bench.hands.skinning import only_fingertips
 from hwp_bench.importers.shared.landmarks import PALM, Landmarks
 
-# The joint whose frame a landmark is fixed in: joints in their own, tips in the last joint's.
-_FRAME_OF = (0, 13, 14, 15, 15, 1, 2, 3, 3, 4, 5, 6, 6, 10, 11, 12, 12, 7, 8, 9, 9)
+#: The joint whose frame a landmark is fixed in: joints in their own, tips in the last joint's.
+FRAME_OF = (0, 13, 14, 15, 15, 1, 2, 3, 3, 4, 5, 6, 6, 10, 11, 12, 12, 7, 8, 9, 9)
 #: Pixels in a unit of the anchor: Adam's step is about its learning rate, which this makes sane.
 ANCHOR_UNIT = 100.0
 
@@ -45,6 +46,13 @@ class ClipVariables:
     #: () log of the focal length in px.
     log_focal: torch.Tensor
 
+    def read(self) -> dict[str, np.ndarray]:
+        """Return all by their names, float64."""
+        return {
+            field.name: getattr(self, field.name).detach().double().numpy()
+            for field in fields(self)
+        }
+
 
 @dataclass(frozen=True, eq=False)
 class PosedClip:
@@ -62,20 +70,6 @@ class PosedClip:
     pose: torch.Tensor
 
 
-@dataclass(frozen=True, eq=False)
-class SomeVertices:
-    """Vertices chosen in every frame, with what posing them needs; read once for many steps."""
-
-    #: (F, P) int64.
-    index: torch.Tensor
-    #: (F, P, 3) m, rest place without the shape: template and correctives.
-    rest: torch.Tensor
-    #: (F, P, 3, 10) m per unit of shape.
-    shape_basis: torch.Tensor
-    #: (F, P, 16) skinning weights.
-    weights: torch.Tensor
-
-
 class ClipModel:
     """Poses a clip from its variables, which are relative to a start.
 
@@ -87,9 +81,14 @@ class ClipModel:
     ) -> None:
         self.template = template
         self.tensors = template.to_torch(torch.float32)
-        self.start_rotation = torch.as_tensor(start.rotation, dtype=torch.float32)
-        self.world = torch.as_tensor(start.world, dtype=torch.float32)
-        self.centre = torch.as_tensor(centre, dtype=torch.float32)
+        #: (F, 3, 3) float64, the start's rotations.
+        self.start = np.ascontiguousarray(start.rotation, np.float64)
+        self._start = torch.as_tensor(start.rotation, dtype=torch.float32)
+        #: (F, 21, 3) m, the start's world landmarks.
+        self.world = start.world
+        #: (2,) px.
+        self.centre = np.asarray(centre, np.float64)
+        self._centre = torch.as_tensor(centre, dtype=torch.float32)
         self._tips = only_fingertips(self.tensors)
         anchor = start.wrist[:, :2] / start.wrist[:, 2:] * focal / ANCHOR_UNIT
         frames = len(start.wrist)
@@ -119,11 +118,11 @@ class ClipModel:
         frames = len(free.turn)
         pose = torch.cat([torch.zeros_like(free.fingers[:, :1]), free.fingers], dim=1)
         rest = pose_hand(self._tips, pose, free.betas, pose.new_zeros(frames, 3))
-        rotation = self.start_rotation @ axis_angle_to_matrix(free.turn)
+        rotation = self._start @ axis_angle_to_matrix(free.turn)
         depth = free.log_depth.exp()
         wrist = torch.cat([free.anchor * (ANCHOR_UNIT / self.focal) * depth, depth], dim=1)
         place = wrist - (rotation @ rest.joints[:, 0, :, None])[..., 0]
-        turned = rest.transforms[:, list(_FRAME_OF), :3, :3] @ free.offsets[..., None]
+        turned = rest.transforms[:, list(FRAME_OF), :3, :3] @ free.offsets[..., None]
         return PosedClip(
             rotation=rotation,
             place=place,
@@ -132,32 +131,9 @@ class ClipModel:
             pose=pose,
         )
 
-    def choose(self, index: torch.Tensor) -> SomeVertices:
-        """Choose vertices (F, P) int64 of each frame; correctives stay as they are now."""
-        rest = self.tensors.vertices[index]
-        basis = self.tensors.pose_basis
-        if basis is not None:
-            with torch.no_grad():
-                turns = axis_angle_to_matrix(self.variables.fingers)
-                feature = (turns - torch.eye(3)).flatten(1)
-                rest = rest + torch.stack(
-                    [basis[some] @ row for some, row in zip(index, feature, strict=True)]
-                )
-        return SomeVertices(
-            index, rest, self.tensors.shape_basis[index], self.tensors.weights[index]
-        )
-
-    def vertices(self, posed: PosedClip, some: SomeVertices) -> torch.Tensor:
-        """Pose some vertices of each frame: (F, P, 3) m, camera axes."""
-        shaped = some.rest + some.shape_basis @ self.variables.betas
-        motion = posed.transforms[:, :, :3].flatten(start_dim=2)
-        blended = (some.weights @ motion).unflatten(-1, (3, 4))
-        skinned = (blended[..., :3] @ shaped[..., None])[..., 0] + blended[..., 3]
-        return skinned @ posed.rotation.mT + posed.place[:, None]
-
     def pixels(self, points: torch.Tensor) -> torch.Tensor:
         """Project (F, P, 3) m to (F, P, 2) px; points at the camera's plane stay finite."""
-        return points[..., :2] / points[..., 2:].clamp(min=1e-3) * self.focal + self.centre
+        return points[..., :2] / points[..., 2:].clamp(min=1e-3) * self.focal + self._centre
 
     def parameters(self, valid: np.ndarray) -> HandParameters:
         """Return the clip as hand parameters, the root rotation continuous in time."""
@@ -310,17 +286,31 @@ def _place(shape: np.ndarray, rays: np.ndarray) -> np.ndarray:
 FRAME_VARIABLES = 51
 
 
-def frame_variables(variables: ClipVariables) -> torch.Tensor:
-    """Join what differs from frame to frame: (F, 51), differentiable."""
-    parts = (variables.turn, variables.fingers.flatten(1), variables.anchor, variables.log_depth)
-    return torch.cat(parts, dim=1)
+# Where they lie in a row.
+_COLUMNS = {
+    "turn": slice(0, 3),
+    "fingers": slice(3, 48),
+    "anchor": slice(48, 50),
+    "log_depth": slice(50, 51),
+}
+
+
+def join_frames(values: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Join what differs from frame to frame, of values by the name of their variable: (F, 51)."""
+    return np.concatenate([values[name].reshape(len(values[name]), -1) for name in _COLUMNS], 1)
+
+
+def split_frames(rows: np.ndarray) -> dict[str, np.ndarray]:
+    """Undo `join_frames`."""
+    parts = {name: rows[:, columns] for name, columns in _COLUMNS.items()}
+    return {**parts, "fingers": parts["fingers"].reshape(-1, 15, 3)}
 
 
 class SurfaceMotion:
     """Derivatives of the vertices' pixels by the variables of their frame, in closed form.
 
     Automatic differentiation would need one pass for each of thousands of pixels. Correctives
-    count as they are and not in how they change, as in `ClipModel.choose`. The model is read once.
+    count as they are and not in how they change. The model is read once.
     """
 
     def __init__(self, model: ClipModel) -> None:

@@ -25,10 +25,10 @@ from hwp_bench.importers.shared.frames import CropWindows, each_frame
 from hwp_bench.importers.video.model import (
     FRAME_VARIABLES,
     ClipModel,
-    PosedClip,
     SurfaceMotion,
-    frame_variables,
+    join_frames,
     pose_vertices,
+    split_frames,
 )
 
 # Texels beyond a chart that continue as its border, so that interpolation reads nothing else.
@@ -371,20 +371,21 @@ class SurfaceResidual(ABC):
             return linearize(motion, frame, self._faces, found, self.pictures.ratio)
 
         self.collect(usable, each_frame(seen, usable))
-        self._start = frame_variables(model.variables).detach().clone()
+        self._start = join_frames(model.variables.read())
         curvature = np.zeros((len(self._start), FRAME_VARIABLES, FRAME_VARIABLES))
         slope = np.zeros((len(self._start), FRAME_VARIABLES))
         for frame, found in zip(usable, each_frame(linear, usable), strict=True):
             if found is not None:
                 curvature[frame], slope[frame] = found
-        self._curvature = torch.as_tensor(curvature, dtype=torch.float32)
-        self._slope = torch.as_tensor(slope, dtype=torch.float32)
+        self._curvature, self._slope = curvature, slope
 
-    def __call__(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
-        """Return the energy, a scalar; zero where it was linearised."""
-        step = frame_variables(model.variables) - self._start
+    def add(self, free: dict[str, np.ndarray], slopes: dict[str, np.ndarray]) -> float:
+        """Add the derivatives by the variables; return the energy, zero where it was linearised."""
+        step = join_frames(free) - self._start
         bent = (self._curvature @ step[..., None])[..., 0]
-        return self._weight * (step * (0.5 * bent + self._slope)).sum()
+        for name, part in split_frames(self._weight * (bent + self._slope)).items():
+            slopes[name] += part
+        return self._weight * float((step * (0.5 * bent + self._slope)).sum())
 
 
 def linearize(

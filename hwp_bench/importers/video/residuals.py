@@ -8,19 +8,20 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 import torch
 
 from hwp_bench.hands import HandTemplate
-from hwp_bench.hands.articulation import anatomical_limits, joint_limit_penalty
+from hwp_bench.hands.articulation import anatomical_limits, axis_angle_to_matrix
 from hwp_bench.hands.raster import draw_silhouette
 from hwp_bench.hands.skeleton import FINGERS, finger_joints, palm_directions, unit
 from hwp_bench.hands.template import boundary_vertices
 from hwp_bench.importers.shared.frames import CropWindows, cells, each_frame
 from hwp_bench.importers.shared.landmarks import Landmarks
-from hwp_bench.importers.video.model import ClipModel, PosedClip, pose_vertices
+from hwp_bench.importers.video.model import ClipModel, pose_vertices
 from hwp_bench.importers.video.pictures import sample
 
 # --- Landmarks, motion, and what is known of hands
@@ -37,8 +38,8 @@ _START_IMAGE_WEIGHT = 0.05
 _MOTION_SCALE, _TURNING_SCALE = 0.003, 0.06
 # Weight of both.
 _MOTION_WEIGHT = 0.3
-# Weight of the joint-limit penalty (rad^2 beyond the anatomical range).
-_LIMIT_WEIGHT = 300.0
+#: Weight of the joint-limit penalty (rad^2 beyond the anatomical range).
+LIMIT_WEIGHT = 300.0
 # Weight of the finger angles squared: it keeps undetermined angles near the rest pose.
 _POSE_WEIGHT = 0.02
 # Constant distance between the tracker's landmark and the model's joint, m.
@@ -66,135 +67,135 @@ class LandmarkResidual:
         default_focal: float | None,
     ) -> None:
         self.default_focal = default_focal
-        self.image = torch.as_tensor(landmarks.image, dtype=torch.float32)
-        self.weight = torch.as_tensor(
-            np.where(landmarks.detected, landmarks.score, 0.0), dtype=torch.float32
-        )[:, None]
-        self.world = model.world - model.world.mean(dim=1, keepdim=True)
+        self.image = landmarks.image
+        self.weight = np.where(landmarks.detected, landmarks.score, 0.0)[:, None]
+        #: (F, 21, 3) m, about their mean.
+        self.world = model.world - model.world.mean(axis=1, keepdims=True)
         self.image_scale = IMAGE_SCALE * landmarks.hand_size
         self.limits = anatomical_limits(model.template)
-        self.contact = ContactResidual(model.template)
+        self.contact = template_spheres(model.template)
+        self.pairs, self.least = touching_pairs(self.contact)
         self.steps = steps
         self.prior = _PRIOR_SHARE * float(landmarks.detected.sum())
 
-    def __call__(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
-        """Return the energy, a scalar."""
-        image = (self.weight * geman_mcclure(self._image_error(model, posed))).sum()
-        return image + _WORLD_WEIGHT * self._world(model, posed) + self._rest(model, posed)
-
-    def from_afar(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
-        """Return the energy for the first steps, when most fingers are bent wrongly.
-
-        Only the world landmarks, which dominate, show in which direction a finger bends.
-        """
-        image = (self.weight * charbonnier(self._image_error(model, posed))).sum()
-        return _START_IMAGE_WEIGHT * image + self._world(model, posed) + self._rest(model, posed)
-
     def weaken(self, weights: np.ndarray) -> None:
         """Multiply the weights of landmarks by (F, 21) numbers: some are hidden."""
-        self.weight = self.weight * torch.as_tensor(weights, dtype=torch.float32)
+        self.weight = self.weight * weights
 
-    def _image_error(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
-        return (((model.pixels(posed.landmarks) - self.image) / self.image_scale) ** 2).sum(dim=-1)
+    def pull(
+        self,
+        points: np.ndarray,
+        centre: np.ndarray,
+        focal: float,
+        log_size: float,
+        *,
+        afar: bool = False,
+    ) -> tuple[float, np.ndarray, float, float]:
+        """Compare the hand's landmarks (F, 21, 3) m, camera axes, with the tracker's.
 
-    def _world(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
+        `afar`: for the first steps, when most fingers are bent wrongly. Only the world landmarks,
+        which dominate then, show in which direction a finger bends. `centre` is px.
+
+        Returns:
+            the energy, and its derivatives by the points, by log size and by log focal length.
+        """
+        depth = np.maximum(points[..., 2], 1e-3)
+        aside = points[..., :2] / depth[..., None] * focal
+        error = (aside + centre - self.image) / self.image_scale
+        if afar:
+            values, rates = charbonnier((error**2).sum(axis=-1))
+            share, world_share = _START_IMAGE_WEIGHT, 1.0
+        else:
+            values, rates = geman_mcclure((error**2).sum(axis=-1))
+            share, world_share = 1.0, _WORLD_WEIGHT
+        energy = share * float((self.weight * values).sum())
+        by_pixels = (2.0 * share / self.image_scale) * (self.weight * rates)[..., None] * error
+        along = (by_pixels * aside).sum(axis=-1)
+        slope = np.empty_like(points)
+        slope[..., :2] = by_pixels * (focal / depth)[..., None]
+        slope[..., 2] = np.where(points[..., 2] > 1e-3, -along / depth, 0.0)
         # Compared at the tracker's own scale: measured at the hand's, a hand that shrinks to
         # nothing would fit best.
-        centred = posed.landmarks - posed.landmarks.mean(dim=1, keepdim=True)
-        error = centred * torch.exp(-model.variables.log_size) - self.world
-        squared = ((error / WORLD_SCALE) ** 2).sum(dim=-1)
-        return (self.weight * charbonnier(squared)).sum()
+        factor = float(np.exp(-log_size))
+        scaled = (points - points.mean(axis=1, keepdims=True)) * factor
+        error = (scaled - self.world) / WORLD_SCALE
+        values, rates = charbonnier((error**2).sum(axis=-1))
+        energy += world_share * float((self.weight * values).sum())
+        by_scaled = (2.0 * world_share / WORLD_SCALE) * (self.weight * rates)[..., None] * error
+        by_size = -float((by_scaled * scaled).sum())
+        slope += factor * (by_scaled - by_scaled.mean(axis=1, keepdims=True))
+        energy += self._add_motion(points, _MOTION_SCALE, slope)
+        return energy, slope, by_size, float(along.sum())
 
-    def _rest(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
-        free, motion = model.variables, posed.landmarks.new_zeros(())
-        for track, scale in ((posed.landmarks, _MOTION_SCALE), (free.fingers, _TURNING_SCALE)):
-            if self.steps is not None and len(track) > 2:
-                bend = acceleration(track, self.steps, scale)
-                motion = motion + charbonnier((bend**2).sum(dim=-1)).sum()
-        anatomy = _LIMIT_WEIGHT * joint_limit_penalty(posed.pose, self.limits).sum()
-        anatomy = anatomy + self.contact(model, posed)
-        anatomy = anatomy + _POSE_WEIGHT * (free.fingers**2).sum()
-        constant = (free.betas**2).sum() + ((free.offsets / _OFFSET_SCALE) ** 2).sum()
-        constant = constant + (free.log_size / _SIZE_SCALE) ** 2
+    def add_priors(self, free: dict[str, np.ndarray], slopes: dict[str, np.ndarray]) -> float:
+        """Add what the variables cost by themselves to their derivatives; return the energy."""
+        fingers, betas, offsets = free["fingers"], free["betas"], free["offsets"] / _OFFSET_SCALE
+        energy = self._add_motion(fingers, _TURNING_SCALE, slopes["fingers"])
+        energy += _POSE_WEIGHT * float((fingers**2).sum())
+        slopes["fingers"] += 2.0 * _POSE_WEIGHT * fingers
+        size, focal = float(free["log_size"]) / _SIZE_SCALE, 0.0
         if self.default_focal is not None:
-            focal = (free.log_focal - float(np.log(self.default_focal))) / _FOCAL_SCALE
-            constant = constant + focal**2
-        return _MOTION_WEIGHT * motion + (anatomy + 0.5 * self.prior * constant)
+            focal = (float(free["log_focal"]) - float(np.log(self.default_focal))) / _FOCAL_SCALE
+        constant = float((betas**2).sum() + (offsets**2).sum()) + size**2 + focal**2
+        slopes["betas"] += self.prior * betas
+        slopes["offsets"] += self.prior * offsets / _OFFSET_SCALE
+        slopes["log_size"] += self.prior * size / _SIZE_SCALE
+        slopes["log_focal"] += self.prior * focal / _FOCAL_SCALE
+        return energy + 0.5 * self.prior * constant
+
+    def _add_motion(self, track: np.ndarray, unit: float, slope: np.ndarray) -> float:
+        """Add the acceleration of tracks (F, N, 3) to the slope by them; return its energy."""
+        if self.steps is None or len(track) < 3:
+            return 0.0
+        first, middle, last = acceleration_weights(self.steps, unit)
+        bend = first * track[:-2] + middle * track[1:-1] + last * track[2:]
+        values, rates = charbonnier((bend**2).sum(axis=-1))
+        by_bend = 2.0 * _MOTION_WEIGHT * rates[..., None] * bend
+        slope[:-2] += first * by_bend
+        slope[1:-1] += middle * by_bend
+        slope[2:] += last * by_bend
+        return _MOTION_WEIGHT * float(values.sum())
 
 
-def acceleration(track: torch.Tensor, steps: np.ndarray, unit: float) -> torch.Tensor:
-    """Return the second derivative of a track (F, ...) by time, (F - 2, ...), in some unit.
+def acceleration_weights(
+    steps: np.ndarray, unit: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Weights of three frames in a row whose sum is the second derivative by time, in some unit.
 
-    Of frames that are h and k apart it is ((z - y) / k - (y - x) / h) 2 / (h + k): the second
-    divided difference, times 2.
+    Of frames x, y, z that are h and k apart it is ((z - y) / k - (y - x) / h) 2 / (h + k): the
+    second divided difference, times 2. Each is (F - 2, 1, 1) for (F - 1,) steps.
     """
-    before, after = steps[:-1], steps[1:]
-    shape = (-1, *(1,) * (track.ndim - 1))
-    first, last, scale = (
-        torch.as_tensor(values, dtype=track.dtype).reshape(shape)
-        for values in (
-            2.0 * after / (before + after),
-            2.0 * before / (before + after),
-            unit * (before * after),
-        )
-    )
-    return (last * track[2:] - 2.0 * track[1:-1] + first * track[:-2]) / scale
+    before, after = steps[:-1, None, None], steps[1:, None, None]
+    first, last = 2.0 / (before * (before + after)), 2.0 / (after * (before + after))
+    return first / unit, -2.0 / (before * after * unit), last / unit
 
 
-def geman_mcclure(squared: torch.Tensor, turn: float = 2.0) -> torch.Tensor:
-    """r^2 / (1 + r^2 / (4 turn^2)) of r^2: quadratic for small r, constant for outliers.
+def geman_mcclure(squared: np.ndarray, turn: float = 2.0) -> tuple[np.ndarray, np.ndarray]:
+    """r^2 / (1 + r^2 / (4 turn^2)) of r^2, and its derivative by r^2.
 
-    The pull fades beyond a residual of `turn` scales. Source: Geman and McClure, 1987, scaled to
-    the second derivative of r^2.
+    It is quadratic for small r, constant for outliers: the pull fades beyond a residual of `turn`
+    scales. Source: Geman and McClure, 1987, scaled to the second derivative of r^2.
     """
-    return squared / (1.0 + squared / (4.0 * turn * turn))
+    flat = 1.0 / (1.0 + squared / (4.0 * turn * turn))
+    return squared * flat, flat * flat
 
 
-def charbonnier(squared: torch.Tensor) -> torch.Tensor:
-    """2 (sqrt(1 + r^2) - 1): quadratic for small r, linear beyond."""
-    return 2.0 * (torch.sqrt(1.0 + squared) - 1.0)
+def charbonnier(squared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """2 (sqrt(1 + r^2) - 1) of r^2, quadratic for small r and linear beyond; and its derivative."""
+    root = np.sqrt(1.0 + squared)
+    return 2.0 * (root - 1.0), 1.0 / root
 
 
 # --- Fingers in fingers
 
 #: Share of the radii that counts: skin and flesh give way.
 FIRMNESS = 0.85
-# Overlap of fingers with each other or the palm that is still ordinary, m; and its weight.
-_CONTACT_SCALE, _CONTACT_WEIGHT = 0.003, 0.5
+#: Overlap of fingers with each other or the palm that is still ordinary, m; and its weight.
+CONTACT_SCALE, CONTACT_WEIGHT = 0.003, 0.5
 # Slices along each finger segment and along each metacarpal.
 _FINGER_SLICES, _PALM_SLICES = 2, 3
 # A sphere of fewer vertices does not measure thickness.
 _LEAST_VERTICES = 4
-
-
-class ContactResidual:
-    """Squared overlap of spheres in a hand."""
-
-    def __init__(self, template: HandTemplate) -> None:
-        spheres = template_spheres(template)
-        pairs, distance = touching_pairs(spheres)
-        self.centres = torch.as_tensor(spheres.centres, dtype=torch.float32)
-        self.basis = torch.as_tensor(spheres.basis, dtype=torch.float32)
-        self.joints = torch.as_tensor(spheres.joints)
-        least = np.zeros((len(spheres.radii),) * 2)
-        least[tuple(pairs.T)] = distance
-        self.least = torch.as_tensor(least, dtype=torch.float32)
-
-    def __call__(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
-        """Return the energy, a scalar."""
-        rest = self.centres + self.basis @ model.variables.betas
-        motion = posed.transforms[:, self.joints]
-        places = (motion[..., :3, :3] @ rest[..., None])[..., 0] + motion[..., :3, 3]
-        # Few pairs touch: find them without gradients, then treat only those.
-        with torch.no_grad():
-            frame, first, second = torch.nonzero(
-                torch.cdist(places, places) < self.least, as_tuple=True
-            )
-        apart = places[frame, first] - places[frame, second]
-        # A tiny length keeps the root's gradient finite for centres that meet.
-        length = torch.sqrt((apart**2).sum(dim=-1) + 1e-10)
-        overlap = (self.least[first, second] - length).clamp(min=0.0) / _CONTACT_SCALE
-        return _CONTACT_WEIGHT * (overlap**2).sum()
 
 
 @dataclass(frozen=True, eq=False)
@@ -295,14 +296,44 @@ FIELD_SIZE = 192
 REACH = 0.06
 # Outline error in the image, as a share of the hand's size in the image.
 _OUTLINE_SCALE = 0.007
-# Weight of one outline vertex; neighbours agree, so each counts little.
-_OUTLINE_WEIGHT = 0.2
+#: Weight of one outline vertex; neighbours agree, so each counts little.
+OUTLINE_WEIGHT = 0.2
+#: Scales beyond which the pull of an outline fades.
+OUTLINE_TURN = 4.0
 # Outline vertices of each frame.
 _OUTLINE_COUNT = 200
 # Vertices of the outline lie at most this far inside the silhouette, px of the field.
 _OUTLINE_WITHIN = 1.6
 # Step of the search along a normal, px of the field.
 _STEP = 0.5
+
+
+class Outlines(NamedTuple):
+    """P outline vertices of each frame and the lines that they are pulled to; float64."""
+
+    #: (F, P) int64; (F, P, 3) m, at rest with correctives as they were, without the shape.
+    vertices: np.ndarray
+    rest: np.ndarray
+    #: (F, P, 2) and (F, P), of `Outline`; (F, 2) px, corners of the windows.
+    normal: np.ndarray
+    target: np.ndarray
+    corners: np.ndarray
+    #: (V, 3) m, what the shape adds; (V, 3, 10); (V, B) the bones of a vertex, and their weights.
+    shaped: np.ndarray
+    basis: np.ndarray
+    bones: np.ndarray
+    weights: np.ndarray
+    #: Px of the field to one of the frame; an error that is still normal, px of the field.
+    ratio: float
+    scale: float
+
+    @classmethod
+    def nothing(cls, frames: int) -> Outlines:
+        """Return outlines that have no vertices."""
+        none = np.zeros((frames, 0))
+        chosen = none.astype(np.int64), none[..., None], none[..., None], none
+        vertices = np.zeros((0, 3)), np.zeros((0, 3, 10)), np.zeros((0, 0), np.int64)
+        return cls(*chosen, np.zeros((frames, 2)), *vertices, np.zeros((0, 0)), 1.0, 1.0)
 
 
 class OutlineResidual:
@@ -331,7 +362,7 @@ class OutlineResidual:
         self.ignored = ignored
         self.usable = np.asarray(usable) & (np.abs(fields).max(axis=(1, 2)) > 0)
         self.ratio = FIELD_SIZE / windows.side
-        self.corners = torch.as_tensor(windows.corners, dtype=torch.float32)[:, None]
+        self.corners = windows.corners.astype(np.float64)
         self.scale = _OUTLINE_SCALE * hand_size * self.ratio
         self.reach = REACH * hand_size * self.ratio
 
@@ -340,8 +371,8 @@ class OutlineResidual:
         faces = model.template.faces
         candidates = np.setdiff1d(np.arange(len(model.template.vertices)), boundary_vertices(faces))
         with torch.no_grad():
-            vertices = torch.as_tensor(pose_vertices(model))
-            pixels = self._in_field(model.pixels(vertices)).numpy()
+            pixels = model.pixels(torch.as_tensor(pose_vertices(model))).numpy()
+        pixels = (pixels - self.corners[:, None]) * self.ratio
 
         def match(frame: int) -> Outline:
             if not self.usable[frame]:
@@ -353,21 +384,38 @@ class OutlineResidual:
             return match_outline(pixels[frame], faces, usable, self.fields[frame], self.reach)
 
         matches = list(each_frame(match, range(len(self.usable))))
-        index, self.normal, self.target = (
-            torch.as_tensor(np.stack([getattr(match, name) for match in matches]))
+        index, normal, target = (
+            np.stack([getattr(match, name) for match in matches])
             for name in ("index", "normal", "target")
         )
-        self.outline = model.choose(index)
+        template = model.template
+        rest = template.vertices[index]
+        if template.pose_basis is not None:
+            with torch.no_grad():
+                turns = axis_angle_to_matrix(model.variables.fingers.double())
+            feature = (turns - torch.eye(3)).flatten(1).numpy()
+            for frame, some in enumerate(index):
+                rest[frame] += template.pose_basis[some] @ feature[frame]
+        # Most vertices move with two bones or three.
+        most = int((template.weights > 0.0).sum(axis=1).max())
+        bones = np.argsort(-template.weights, axis=1, kind="stable")[:, :most]
+        self.outlines = Outlines(
+            index,
+            rest,
+            normal.astype(np.float64),
+            target.astype(np.float64),
+            self.corners,
+            np.zeros_like(template.vertices),
+            np.ascontiguousarray(template.shape_basis, np.float64),
+            np.ascontiguousarray(bones),
+            np.take_along_axis(template.weights, bones, axis=1).astype(np.float64),
+            self.ratio,
+            self.scale,
+        )
 
-    def __call__(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
-        """Return the energy, a scalar."""
-        pixels = self._in_field(model.pixels(model.vertices(posed, self.outline)))
-        # A vertex without a match has a zero normal and a zero target.
-        distance = (pixels * self.normal).sum(dim=-1) - self.target
-        return _OUTLINE_WEIGHT * geman_mcclure((distance / self.scale) ** 2, turn=4.0).sum()
-
-    def _in_field(self, pixels: torch.Tensor) -> torch.Tensor:
-        return (pixels - self.corners) * self.ratio
+    def shaped(self, betas: np.ndarray) -> Outlines:
+        """Return what `rematch` chose, for a shape (10,)."""
+        return self.outlines._replace(shaped=self.outlines.basis @ betas)
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -14,7 +13,8 @@ from hwp_bench.hands import HandTemplate, load_template, pose_hand
 from hwp_bench.hands.fitting import minimize
 from hwp_bench.hands.skeleton import SIDES
 from hwp_bench.importers.shared.landmarks import LANDMARK_NAMES, Landmarks
-from hwp_bench.importers.video.model import ClipModel, PosedClip, rigid_start
+from hwp_bench.importers.video.gradients import ClipEnergy
+from hwp_bench.importers.video.model import ClipModel, rigid_start
 from hwp_bench.importers.video.pictures import PictureResidual, SurfaceResidual
 from hwp_bench.importers.video.residuals import LandmarkResidual, OutlineResidual
 
@@ -153,8 +153,9 @@ def fit_landmarks(
     prior = footage.first_focal if footage.focal is None else None
     residual = LandmarkResidual(landmarks, model, footage.steps(len(landmarks.score)), prior)
     hold = () if footage.focal is None else ("log_focal",)
-    descend(model, residual.from_afar, settings.start_steps, hold=_CONSTANTS, tick=tick)
-    descend(model, residual, settings.landmark_steps, hold=hold, tick=tick)
+    afar = ClipEnergy(residual, afar=True)
+    descend(model, afar, settings.start_steps, hold=_CONSTANTS, tick=tick)
+    descend(model, ClipEnergy(residual), settings.landmark_steps, hold=hold, tick=tick)
     return FittedClip(model, residual, settings)
 
 
@@ -171,11 +172,15 @@ def share_camera(hands: Sequence[FittedClip], *, steps: int) -> None:
         with torch.no_grad():
             hand.model.variables.log_focal.fill_(shared)
             hand.model.variables.log_depth.add_(shared - own)
-        descend(hand.model, hand.landmarks, steps, rate=_REFINING, hold=("log_focal",))
+        descend(hand.model, ClipEnergy(hand.landmarks), steps, rate=_REFINING, hold=("log_focal",))
 
 
 def refine(
-    fitted: FittedClip, *residuals: OutlineResidual | SurfaceResidual, tick: Tick = _no_tick
+    fitted: FittedClip,
+    outline: OutlineResidual | None,
+    surface: SurfaceResidual | None = None,
+    *,
+    tick: Tick = _no_tick,
 ) -> None:
     """Refine a fit, in place, by residuals that are matched to the images in each round.
 
@@ -185,18 +190,13 @@ def refine(
     """
     chosen, hold = fitted.settings, _HELD_BY_LANDMARKS
     rounds, steps = chosen.contour_rounds, chosen.contour_steps
-    if any(isinstance(residual, PictureResidual) for residual in residuals):
+    if isinstance(surface, PictureResidual):
         rounds, steps, hold = chosen.picture_rounds, PICTURE_STEPS, _HELD_BY_OUTLINE
-
-    def energy(model: ClipModel, posed: PosedClip) -> torch.Tensor:
-        value = fitted.landmarks(model, posed)
-        for residual in residuals:
-            value = value + residual(model, posed)
-        return value
-
+    energy = ClipEnergy(fitted.landmarks, outline, surface)
     for _ in range(rounds):
-        for residual in residuals:
-            residual.rematch(fitted.model)
+        for residual in (outline, surface):
+            if residual is not None:
+                residual.rematch(fitted.model)
         descend(fitted.model, energy, steps, rate=_REFINING, hold=hold, tick=tick)
 
 
@@ -226,7 +226,7 @@ def reprojection_error(fitted: FittedClip, landmarks: Landmarks) -> Reprojection
 
 def descend(
     model: ClipModel,
-    energy: Callable[[ClipModel, PosedClip], torch.Tensor],
+    energy: ClipEnergy,
     steps: int,
     *,
     rate: float = 1.0,
@@ -243,30 +243,7 @@ def descend(
         if field.name not in hold
     ]
     remedy = "Check the landmarks; a focal length far off can do this too (--focal)."
-    with _one_thread():
-        minimize(
-            groups,
-            lambda _: energy(model, model.pose()),
-            steps,
-            warm_up=_WARM_UP,
-            remedy=remedy,
-            tick=tick,
-        )
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Hold torch to one thread: the operations here are too small to be parallel.
-
-    On a busy machine the threads of a small operation wait for each other, and a fit takes
-    several times as long.
-    """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
+    minimize(groups, lambda _: energy(model), steps, warm_up=_WARM_UP, remedy=remedy, tick=tick)
 
 
 # --- Which side a hand is of
@@ -314,11 +291,11 @@ def side_scores(landmarks: Landmarks, hand_model: str, footage: Footage) -> Side
         model = start_model(few, load_template(hand_model, side), footage)
         # The frames are far apart, so that motion between them is not smooth.
         residual = LandmarkResidual(few, model, None, footage.first_focal)
-        descend(model, residual.from_afar, _SIDE_STEPS, hold=_CONSTANTS)
+        descend(model, ClipEnergy(residual, afar=True), _SIDE_STEPS, hold=_CONSTANTS)
         with torch.no_grad():
-            fitted = model.pose().landmarks
-            centred = fitted - fitted.mean(dim=1, keepdim=True)
-            return float(torch.linalg.vector_norm(centred - residual.world, dim=-1).mean())
+            fitted = model.pose().landmarks.double().numpy()
+        centred = fitted - fitted.mean(axis=1, keepdims=True)
+        return float(np.linalg.norm(centred - residual.world, axis=-1).mean())
 
     right, left = (remaining(side) for side in SIDES)
     return SideScores(right, left, len(chosen))

@@ -11,9 +11,10 @@ from hwp_bench.importers.video.model import (
     FRAME_VARIABLES,
     ClipModel,
     SurfaceMotion,
-    frame_variables,
+    join_frames,
     pose_vertices,
     rigid_start,
+    split_frames,
 )
 
 CENTRE = np.array([WIDTH / 2, HEIGHT / 2])
@@ -37,13 +38,10 @@ def hand_landmarks(joints: np.ndarray) -> np.ndarray:
     return np.asarray(joints[0] - joints[0, 0])
 
 
-def pixels_at(model: ClipModel, values: torch.Tensor) -> np.ndarray:
-    free = model.variables
+def pixels_at(model: ClipModel, values: np.ndarray) -> np.ndarray:
     with torch.no_grad():
-        free.turn.copy_(values[:, :3])
-        free.fingers.copy_(values[:, 3:48].unflatten(1, (15, 3)))
-        free.anchor.copy_(values[:, 48:50])
-        free.log_depth.copy_(values[:, 50:])
+        for name, part in split_frames(values).items():
+            getattr(model.variables, name).copy_(torch.as_tensor(part))
         return np.asarray(model.pixels(torch.as_tensor(pose_vertices(model))).double().numpy())
 
 
@@ -55,10 +53,10 @@ def test_pixels_move_as_the_derivatives_say(correctives: bool) -> None:
     some = np.arange(0, len(model.template.vertices), 40)
     motion = SurfaceMotion(model)
     found = np.stack([motion.by_variables(frame, some) for frame in range(3)])
-    start = frame_variables(model.variables).detach().clone()
+    start = join_frames(model.variables.read())
     columns = range(FRAME_VARIABLES) if not correctives else (0, 1, 2, 48, 49, 50)
     for column in columns:
-        step = torch.zeros(FRAME_VARIABLES)
+        step = np.zeros(FRAME_VARIABLES)
         step[column] = 0.004
         ahead, behind = pixels_at(model, start + step), pixels_at(model, start - step)
         expected = (ahead - behind)[:, some] / 0.008

@@ -22,7 +22,7 @@ from painted_clip import (
 )
 
 from hwp_bench.hands.raster import draw_faces, mix_corners
-from hwp_bench.importers.video.model import ClipModel, SurfaceMotion, frame_variables, pose_vertices
+from hwp_bench.importers.video.model import ClipModel, SurfaceMotion, pose_vertices
 from hwp_bench.importers.video.pictures import (
     Atlas,
     Differences,
@@ -49,7 +49,7 @@ def test_a_painted_hand_comes_nearer_to_its_truth_than_by_its_outline() -> None:
     for painted in (False, True):
         fitted = fit_to_errors()
         contour = OutlineResidual(fields, clip.landmarks.detected, windows, HAND)
-        refine(fitted, contour, *([texture_of(fitted)] if painted else []))
+        refine(fitted, contour, texture_of(fitted) if painted else None)
         errors.append(pixel_error(fitted))
     # 0.78 and 0.93 px when this was written.
     assert errors[1] < 0.92 * errors[0]
@@ -59,7 +59,6 @@ def test_the_energy_and_its_slope_are_those_of_the_linearisation() -> None:
     # Zero where it was linearised; one step down the slope lowers it. Twice gives the same bits.
     fitted = fit_to_errors()
     assert_slopes_lead_down(fitted, [texture_of(fitted), texture_of(fitted)])
-    assert frame_variables(fitted.model.variables).shape == (FRAMES, 51)
 
 
 def test_the_mean_texture_is_what_was_painted() -> None:
@@ -107,7 +106,7 @@ def test_a_lit_hand_comes_nearer_to_its_truth_than_by_outline_and_texture() -> N
     before, free = pixel_error(fitted), fitted.model.variables
     held = {name: getattr(free, name).detach().clone() for name in ("betas", "log_depth")}
     done: list[int] = []
-    refine(fitted, picture_of(fitted), tick=lambda: done.append(1))
+    refine(fitted, None, picture_of(fitted), tick=lambda: done.append(1))
     # 0.75 and 0.61 px when this was written.
     assert pixel_error(fitted) < 0.88 * before
     assert len(done) == 120

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,12 +11,13 @@ from synthetic_clip import FOCAL, HEIGHT, WIDTH, disc, make_clip, template
 
 from hwp_bench.hands.articulation import joint_axes
 from hwp_bench.hands.template import boundary_vertices
+from hwp_bench.importers.video.gradients import ClipEnergy
 from hwp_bench.importers.video.masks import behind_wrist
 from hwp_bench.importers.video.model import ClipModel, RigidStart
 from hwp_bench.importers.video.residuals import (
     FIELD_SIZE,
-    ContactResidual,
-    acceleration,
+    LandmarkResidual,
+    acceleration_weights,
     match_outline,
     signed_distance,
     template_spheres,
@@ -27,13 +30,15 @@ def test_acceleration_knows_the_time_between_frames() -> None:
     steps = np.array([1.0, 1.05, 2.0, 1.0, 0.5, 3.0])
     time = np.cumsum([0.0, *steps])
     bend, slope = np.array([0.3, -0.2]), np.array([2.0, 5.0])
-    track = torch.as_tensor(0.5 * np.outer(time**2, bend) + np.outer(time, slope) + 1.0)
-    found = acceleration(track, steps, 0.1).numpy()
-    np.testing.assert_allclose(found, np.tile(bend / 0.1, (5, 1)), atol=1e-12)
-    # Of even steps it is, to the bit, the second difference.
-    even = track.float()
-    expected = (even[2:] - 2.0 * even[1:-1] + even[:-2]) / (0.1 * (30.0 / 24.0) ** 2)
-    assert torch.equal(acceleration(even, np.full(6, 30.0 / 24.0), 0.1), expected)
+    track = (0.5 * np.outer(time**2, bend) + np.outer(time, slope) + 1.0)[:, None]
+    first, middle, last = acceleration_weights(steps, 0.1)
+    found = first * track[:-2] + middle * track[1:-1] + last * track[2:]
+    np.testing.assert_allclose(found, np.tile(bend / 0.1, (5, 1, 1)), atol=1e-12)
+    # Of even steps it is the second difference.
+    for weight, share in zip(
+        acceleration_weights(np.full(6, 30.0 / 24.0), 0.1), (1, -2, 1), strict=True
+    ):
+        np.testing.assert_allclose(weight, share / (0.1 * (30.0 / 24.0) ** 2), rtol=1e-15)
 
 
 def disc_mask(centre: np.ndarray, radius: float, size: int = FIELD_SIZE) -> np.ndarray:
@@ -121,6 +126,21 @@ def model(side: str, fingers: np.ndarray) -> ClipModel:
     return made
 
 
+def untracked(clip: ClipModel) -> LandmarkResidual:
+    """Residuals of a clip whose landmarks have no weight."""
+    tracked = make_clip(len(clip.start)).landmarks
+    unsure = replace(tracked, score=np.zeros(len(clip.start)))
+    return LandmarkResidual(unsure, clip, None, None)
+
+
+def contact_energy(clip: ClipModel) -> float:
+    """What the energy loses where spheres may come as near as they like."""
+    terms = untracked(clip)
+    everything, _ = ClipEnergy(terms).differentiate(clip)
+    terms.least[:] = 0.0
+    return everything - ClipEnergy(terms).differentiate(clip)[0]
+
+
 @pytest.mark.parametrize("side", ["right", "left"])
 def test_rest_is_free_and_a_crossing_finger_is_not(side: str) -> None:
     axes = joint_axes(template(side))
@@ -128,22 +148,22 @@ def test_rest_is_free_and_a_crossing_finger_is_not(side: str) -> None:
     # The index finger sideways through the middle finger; the ring finger through the palm.
     poses[1, 0] = -0.6 * axes[0, :, 1]
     poses[2, 9:12] = 2.0 * axes[9:12, :, 0]
-    energies = []
-    for pose in poses:
-        clip = model(side, pose[None])
-        energies.append(ContactResidual(template(side))(clip, clip.pose()))
-    assert float(energies[0].detach()) < 5e-7
-    assert float(energies[1].detach()) > 5
-    assert float(energies[2].detach()) > 5
+    free, crossing, through = (contact_energy(model(side, pose[None])) for pose in poses)
+    assert abs(free) < 5e-7
+    assert crossing > 5
+    assert through > 5
 
 
 def test_gradients_are_finite_where_centres_meet() -> None:
     clip = model("right", np.zeros((1, 15, 3)))
-    contact = ContactResidual(template())
-    contact.least.fill_(0.01)  # every sphere touches itself
-    contact(clip, clip.pose()).backward()
-    assert clip.variables.fingers.grad is not None
-    assert torch.isfinite(clip.variables.fingers.grad).all()
+    terms = untracked(clip)
+    terms.contact.joints[:] = 0
+    terms.contact.centres[:] = clip.template.joints[0]
+    terms.contact.basis[:] = 0.0
+    value, slopes = ClipEnergy(terms).differentiate(clip)
+    assert np.isfinite(value)
+    for slope in slopes.values():
+        assert np.isfinite(slope).all()
 
 
 def test_spheres_lie_inside_the_hand() -> None:
@@ -163,4 +183,4 @@ def test_the_fist_of_a_synthetic_clip_costs_little() -> None:
     # An ordinary closing hand must not be fought: below one ordinary overlap a frame.
     known = make_clip(5, bend=0.5)
     clip = model("right", known.hand.pose[:, 1:])
-    assert float(ContactResidual(template())(clip, clip.pose()).detach()) < 2.5
+    assert contact_energy(clip) < 2.5

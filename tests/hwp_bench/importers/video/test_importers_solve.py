@@ -25,13 +25,20 @@ from hwp_bench.hands import pose_hand
 from hwp_bench.hands.skinning import pose_parameters
 from hwp_bench.importers.shared.frames import cut, follow_hands
 from hwp_bench.importers.shared.landmarks import Landmarks, read_landmarks
+from hwp_bench.importers.video.gradients import ClipEnergy
 from hwp_bench.importers.video.model import (
     interpolate,
     pose_vertices,
     rigid_start,
     unwrap_rotations,
 )
-from hwp_bench.importers.video.residuals import OutlineResidual, signed_distance
+from hwp_bench.importers.video.residuals import (
+    OUTLINE_TURN,
+    OUTLINE_WEIGHT,
+    OutlineResidual,
+    geman_mcclure,
+    signed_distance,
+)
 from hwp_bench.importers.video.solve import (
     CLEAR,
     FittedClip,
@@ -183,7 +190,7 @@ def test_interpolation_holds_the_ends() -> None:
 
 @pytest.mark.parametrize("correctives", [False, True])
 def test_outline_vertices_are_those_of_the_hand_model(correctives: bool) -> None:
-    # The contour term poses a few vertices by itself; `pose_hand` poses all. Float32: 10 um.
+    # The energy poses a few vertices by itself; `pose_vertices` poses all, in float32: 1e-4.
     clip = make_clip(4)
     hand = with_correctives(clip.template) if correctives else clip.template
     footage = Footage(WIDTH, HEIGHT, FPS, FOCAL)
@@ -196,10 +203,18 @@ def test_outline_vertices_are_those_of_the_hand_model(correctives: bool) -> None
     fields = np.stack([signed_distance(mask) for mask in masks])
     contour = OutlineResidual(fields, clip.landmarks.detected, windows, 150.0)
     contour.rematch(fitted.model)
-    everything = pose_vertices(fitted.model)
-    some = fitted.model.vertices(fitted.model.pose(), contour.outline)
-    expected = np.take_along_axis(everything, contour.outline.index.numpy()[..., None], axis=1)
-    np.testing.assert_allclose(some.detach().numpy(), expected, atol=1e-5)
+    matched, terms = contour.outlines, fitted.landmarks
+    with torch.no_grad():
+        pixels = fitted.model.pixels(torch.as_tensor(pose_vertices(fitted.model))).numpy()
+    chosen = np.take_along_axis(pixels, matched.vertices[..., None], axis=1)
+    field = (chosen - matched.corners[:, None]) * matched.ratio
+    away = ((field * matched.normal).sum(axis=2) - matched.target) / matched.scale
+    values, _ = geman_mcclure(away**2, OUTLINE_TURN)
+    with_outline, _ = ClipEnergy(terms, contour).differentiate(fitted.model)
+    without, _ = ClipEnergy(terms).differentiate(fitted.model)
+    assert values.sum() > 1.0
+    expected = OUTLINE_WEIGHT * values.sum()
+    assert with_outline - without == pytest.approx(expected, rel=1e-4)
 
 
 def test_the_outline_pulls_a_displaced_hand_back() -> None:
