@@ -137,8 +137,18 @@ def updated(benchmark: Benchmark, found: Mapping[str, float]) -> Benchmark:
         else ratio
         for ratio in benchmark.ratios
     ]
-    measured = f"{checkout_commit()}, {datetime.datetime.now(datetime.UTC).date().isoformat()}"
-    return dataclasses.replace(benchmark, ratios=ratios, machine=this_machine(), measured=measured)
+    here = origin()
+    measured = f"{here['commit']}, {here['day']}"
+    return dataclasses.replace(benchmark, ratios=ratios, machine=here["machine"], measured=measured)
+
+
+def origin() -> dict[str, str]:
+    """Return where a number is from: the commit, the day, and the processor with its cores."""
+    return {
+        "commit": checkout_commit(),
+        "day": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        "machine": this_machine(),
+    }
 
 
 @functools.cache

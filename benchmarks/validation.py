@@ -15,7 +15,6 @@ setting brings: nothing is tuned by it, and nothing is kept.
 from __future__ import annotations
 
 import argparse
-import datetime
 import json
 import tempfile
 import time
@@ -27,6 +26,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.ratio_store import origin
 from hwp_bench.base.errors import BadInput
 from hwp_bench.base.records import merged
 from hwp_bench.capture import open_capture
@@ -37,7 +37,6 @@ from hwp_bench.evaluation.scoring import Prediction, mean_scores, read_targets, 
 from hwp_bench.methods import find_method, read_manifest
 from hwp_bench.methods.contract import Avatar, Budget, RunSettings
 from hwp_bench.methods.request import open_request, write_request
-from hwp_bench.results.schema import environment
 from hwp_bench.run.worker import load_entry, render_checked
 from hwp_bench.sim.produce.capture import ensure_suite, suite
 
@@ -167,13 +166,7 @@ def kept_score(log: Path, fit: Mapping[str, Any], make: Callable[[], float]) -> 
         if fit.items() <= line.items():
             return float(line["score"])
     score = make()
-    facts = environment()
-    made = {
-        "score": round(score, 4),
-        "commit": facts["commit"],
-        "day": datetime.datetime.now(datetime.UTC).date().isoformat(),
-        "machine": f"{facts['processor']}, {facts['cores']} cores",
-    }
+    made = {"score": round(score, 4), **origin()}
     with log.open("a", encoding="utf-8") as stream:
         stream.write(json.dumps({**fit, **made}) + "\n")
     return score

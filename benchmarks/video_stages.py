@@ -9,7 +9,6 @@ process of its own, as a person would. What it finds takes the place of the same
 from __future__ import annotations
 
 import argparse
-import datetime
 import json
 import subprocess
 import sys
@@ -18,8 +17,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+from benchmarks.ratio_store import origin
 from hwp_bench.base.files import atomic_write
-from hwp_bench.results.schema import environment
 
 #: A JSON object for each way of each video.
 LOG = Path(__file__).with_name("video_stages.jsonl")
@@ -34,16 +33,14 @@ def measure(video: Path, *, quick: bool) -> dict[str, Any]:
         command = [sys.executable, "-c", program, *words]
         made = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
         seconds = time.monotonic() - began
-    facts, here = json.loads(made.stdout), environment()
+    facts = json.loads(made.stdout)
     return {
         "video": video.name,
         "quick": quick,
         "frames": facts["frames"],
         "seconds": round(seconds, 1),
         "stages": {one["name"]: round(one["seconds"], 1) for one in facts["stages"]},
-        "commit": here["commit"],
-        "day": datetime.datetime.now(datetime.UTC).date().isoformat(),
-        "machine": f"{here['processor']}, {here['cores']} cores",
+        **origin(),
     }
 
 

@@ -189,7 +189,7 @@ def graph_cut_hands(
 
     def prompt(frame: int) -> Prompt:
         drawn = np.where(silhouettes[frame], 255, 0).astype(np.uint8)
-        return Prompt(drawn, np.full(drawn.shape, -np.inf), detected=True)
+        return Prompt.without_wrist(drawn, detected=True)
 
     segmented = segment_clip(
         lambda frame: np.ascontiguousarray(images[frame]),

@@ -192,6 +192,11 @@ class Prompt:
     #: Whether the pose comes from a detection, not from interpolation.
     detected: bool
 
+    @classmethod
+    def without_wrist(cls, silhouette: np.ndarray, *, detected: bool) -> Prompt:
+        """Return the prompt of meshes whose wrist has no line: nothing is on the forearm's side."""
+        return cls(silhouette, _no_line(silhouette.shape[0]), detected)
+
 
 @dataclass(frozen=True, eq=False)
 class Segmentation:
@@ -380,7 +385,7 @@ class ProjectedHands:
                 prompts.append(Prompt(hand.silhouette(frame, edge), behind, detected))
         if not prompts:
             nothing = np.zeros((edge, edge), dtype=np.uint8)
-            return Prompt(nothing, np.full(nothing.shape, -np.inf), detected)
+            return Prompt.without_wrist(nothing, detected=detected)
         if len(prompts) == 1:
             return prompts[0]
         first, second = prompts
@@ -468,20 +473,24 @@ def behind_wrist(
     wrist's depth, the plane cuts the image in a line, and the forearm lies behind the line. A
     mesh without an open end, or seen straight along the forearm, has no such line: all -inf.
     """
-    nowhere = np.full((size, size), -np.inf)
     if len(ring) < 3:
-        return nowhere
+        return _no_line(size)
     centre = vertices[ring].mean(axis=0)
     normal = np.linalg.svd(vertices[ring] - centre)[2][2]
     if normal @ (vertices.mean(axis=0) - centre) > 0:
         normal = -normal
     seen = np.linalg.norm(normal[:2])
     if seen == 0:
-        return nowhere
+        return _no_line(size)
     middle = pixels[ring].mean(axis=0)
     along = np.arange(size) + 0.5
     x, y = normal[:2] / seen
     return np.asarray((along[None] - middle[0]) * x + (along[:, None] - middle[1]) * y)
+
+
+def _no_line(size: int) -> np.ndarray:
+    """Distances (size, size) behind a wrist that has no line."""
+    return np.full((size, size), -np.inf)
 
 
 # --- Masks of a clip

@@ -121,7 +121,7 @@ def test_an_object_before_the_hand_stays_out() -> None:
 
 def test_nothing_is_invented_where_no_hand_is_drawn() -> None:
     known = clip()
-    empty = Prompt(np.zeros((WIDTH, WIDTH), np.uint8), np.full((WIDTH, WIDTH), -np.inf), False)
+    empty = Prompt.without_wrist(np.zeros((WIDTH, WIDTH), np.uint8), detected=False)
     found = list(
         segment_clip(
             lambda frame: square(known.picture(frame)),
