@@ -17,7 +17,7 @@ from fitted_parts import (
     share_of_object,
     with_an_object,
 )
-from painted import QUICK, TrainingMaker
+from painted import QUICK, SilentReport, TrainingMaker
 
 from delayed_mask_fit.method import (
     SHAPE,
@@ -27,6 +27,7 @@ from delayed_mask_fit.method import (
     static_pull,
 )
 from hwp_bench.capture import Capture
+from hwp_bench.methods.contract import Budget
 from plain_fit.method import PlainMethod
 from wildghand.plain.recipe import Batch
 
@@ -73,6 +74,13 @@ def test_before_its_share_of_the_fit_nothing_is_left_out_or_learnt(
         assert bool((weights[hand] == 0.0).all()) is not kept
         grown = torch.nn.functional.max_pool2d(hand[:, None].float(), 5, 1, 2)[:, 0] > 0.0
         assert bool((weights[grown] == 0.0).all()) is not kept
+
+
+def test_a_mask_that_begins_late_is_no_divergence(make_training: TrainingMaker) -> None:
+    """Two windows of steps pass before the network's loss joins; the fit takes all its steps."""
+    settings = {**SETTINGS, "mask_from": 0.7, "validated": False}
+    fit = DelayedMaskMethod(settings, 0).fit(make_training(), Budget(), SilentReport())
+    assert fit.steps == settings["steps"]
 
 
 def test_shapes_wait_and_the_network_does_not_slow_down(make_training: TrainingMaker) -> None:
