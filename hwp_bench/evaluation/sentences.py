@@ -5,6 +5,7 @@ Every bad frame is named, up to a number, with a count.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,7 +15,9 @@ from hwp_bench.results.schema import isolation_text
 from hwp_bench.run.worker import LOG
 from hwp_bench.suites.suite import lost_clips
 
-#: Most frames that are named of a capture; the others are counted.
+#: Share of its seconds before which a fit ends early.
+EARLY = 0.5
+#: Most frames of a capture, or fits, that are named; the others are counted.
 SHOWN = 12
 
 
@@ -32,6 +35,9 @@ def outcome_lines(out: Path, results: Results, head: str = "") -> list[str]:
             lines.append(f"log: {folder / LOG}")
         lines += [f"warning: {head}{capture.id}: {text}" for text in read_warnings(folder)]
     lines += [f"warning: {head}{results.suite} {text}" for text in lost_clips(results)]
+    early = early_text(results)
+    if early:
+        lines.append(f"warning: {head}{early}; see {LOG} in their folders")
     return lines + [
         text for text in (times_text(results, head), isolation_text(results, head)) if text
     ]
@@ -68,6 +74,24 @@ def _frames_text(name: str, frames: Sequence[FrameResult]) -> str:
     if len(failed) > SHOWN:
         parts.append(f"and {len(failed) - SHOWN} more")
     return f"{name}: {len(failed)} of {len(frames)} frames: {'; '.join(parts)}"
+
+
+def early_text(results: Results) -> str:
+    """Name the fits that ended within half of their seconds, before their last step; else empty."""
+    seconds, most = results.budget.get("seconds"), results.budget.get("steps") or math.inf
+    if seconds is None:
+        return ""
+    early = [
+        f"{one.id} ({one.steps} steps, {one.fit_seconds:.1f} s)"
+        for one in results.captures
+        if one.steps and one.steps < most and one.fit_seconds is not None
+        if one.fit_seconds < EARLY * seconds
+    ]
+    if not early:
+        return ""
+    named = [*early[:SHOWN], *[f"and {len(early) - SHOWN} more"] * (len(early) > SHOWN)]
+    count, total = len(early), len(results.captures)
+    return f"{count} of {total} fits ended early in {seconds:g} s: {', '.join(named)}"
 
 
 def times_text(results: Results, head: str = "") -> str:

@@ -48,3 +48,21 @@ def test_seconds_by_the_methods_clock_stand_next_to_ours(tmp_path: Path) -> None
     said, ran = 0.001 * len(captures), 8.3 * len(captures)
     expected = f"times: {said:.1f} s of fitting, by the method's clock; processes ran {ran:.1f} s"
     assert expected in lines
+
+
+def test_fits_that_end_within_half_of_their_seconds_are_named(tmp_path: Path) -> None:
+    results = results_example()
+    first, *others = results.captures
+    captures = [replace(first, steps=50, fit_seconds=3.2)]
+    captures += [replace(one, steps=900, fit_seconds=63.9) for one in others]
+
+    def warnings(seconds: float | None, steps: int | None) -> list[str]:
+        budget = {"seconds": seconds, "steps": steps}
+        lines = outcome_lines(tmp_path, replace(results, captures=captures, budget=budget))
+        return [line for line in lines if line.startswith("warning")]
+
+    expected = f"1 of {len(captures)} fits ended early in 64 s: {first.id} (50 steps, 3.2 s)"
+    assert warnings(64.0, 100_000) == [f"warning: {expected}; see log.txt in their folders"]
+    assert warnings(64.0, None) == warnings(64.0, 100_000)
+    # It took all its steps, has enough seconds, or no limit of them.
+    assert warnings(64.0, 50) == warnings(6.0, None) == warnings(None, None) == []
