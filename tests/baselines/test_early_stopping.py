@@ -87,7 +87,9 @@ def error_of(avatar: Avatar, training: TrainingCapture) -> float:
 def test_the_state_of_the_lower_validation_error_is_kept(
     name: str, training: TrainingCapture, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    recipe, avatar, means = misled(training, RECIPES[name])
+    # The shadows of its preset learn darkness faster than its colours.
+    slow = {"shadow_rate": 3e-3} if name == "scan-texture" else {}
+    recipe, avatar, means = misled(training, RECIPES[name], **slow)
     kept = recipe.snapshot()
     found = error_of(avatar, training)
     errors = {}

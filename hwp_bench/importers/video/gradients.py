@@ -116,7 +116,9 @@ class ClipEnergy:
     def __call__(self, model: ClipModel) -> torch.Tensor:
         """Return the energy, a scalar, which is differentiable once by the model's variables."""
         leaves = [getattr(model.variables, field.name) for field in fields(ClipVariables)]
-        value: torch.Tensor = _Known.apply(lambda: self.differentiate(model), *leaves)
+        # A fit that leaves the numbers ends with an error of its own; numpy need not warn of it.
+        with np.errstate(over="ignore", invalid="ignore"):
+            value: torch.Tensor = _Known.apply(lambda: self.differentiate(model), *leaves)
         return value
 
     def differentiate(self, model: ClipModel) -> tuple[float, dict[str, np.ndarray]]:

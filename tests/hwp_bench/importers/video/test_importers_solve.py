@@ -167,7 +167,7 @@ def test_the_fit_repeats_exactly_and_gives_torchs_threads_back() -> None:
 
 
 def test_a_fit_that_leaves_the_numbers_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hwp_bench.importers.video.residuals.WORLD_SCALE", 1e-30)
+    monkeypatch.setattr("hwp_bench.importers.video.residuals.WORLD_SCALE", 1e-200)
     clip = make_clip(4)
     settings = SolveSettings(start_steps=2)
     with pytest.raises(DidNotConverge):
