@@ -109,9 +109,13 @@ class DelayedMaskRecipe(PlainRecipe[DelayedMaskSettings]):
         return weights * (1.0 - max_pool2d(left_out[:, None], 2 * margin + 1, 1, margin)[:, 0])
 
     def loss(self, batch: Batch, drawing: Drawing, weights: torch.Tensor) -> torch.Tensor:
-        """The plain fit's, and the network's own."""
-        loss = super().loss(batch, drawing, weights)
-        return loss if self._network_loss is None else loss + self._network_loss
+        """The plain fit's, with the gradient of the network's own, which adds nothing to it.
+
+        The network's loss begins within the fit and is larger than the images': a loss that rises
+        so much would be taken for a fit that diverges.
+        """
+        loss, own = super().loss(batch, drawing, weights), self._network_loss
+        return loss if own is None else loss + (own - own.detach())
 
     def _teach(
         self, batch: Batch, drawing: Drawing, chance: torch.Tensor, hand: torch.Tensor
