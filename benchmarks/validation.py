@@ -44,9 +44,17 @@ from hwp_bench.sim.produce.capture import ensure_suite, suite
 LOG = Path(__file__).with_name("tuning.jsonl")
 
 
-def read_trials() -> dict[str, dict[str, list[str]]]:
+def read_trials() -> dict[str, dict[str, Any]]:
     """Captures, and texts of settings, by the name of a baseline."""
     return tomllib.loads(Path(__file__).with_name("trials.toml").read_text(encoding="utf-8"))
+
+
+def tried_settings(
+    preset: Mapping[str, Any], listed: Mapping[str, Any], trial: str
+) -> dict[str, Any]:
+    """Return the settings of a trial: a preset, what it had before tuning, and the trial's."""
+    texts = [*listed.get("before", "").split(","), *trial.split(",")]
+    return merged(preset, overrides([text for text in texts if text]))
 
 
 class _Quiet:
@@ -144,7 +152,9 @@ def print_table(method: str, arguments: argparse.Namespace) -> None:
     print(f"\n| {manifest.name} |", " | ".join(item.scene.id for item in items), "| mean |")
     print("| --- |" + " ---: |" * (len(items) + 1), flush=True)
     for text in ["", *trials]:
-        settings = merged(preset, overrides(text.split(",") if text else []))
+        # Rows of one's own differ from today's preset.
+        before = listed if arguments.set is None else {}
+        settings = tried_settings(preset, before, text)
         scores = []
         for path in captures:
             given = method, path, settings, budget, arguments.seed

@@ -10,12 +10,10 @@ import numpy as np
 import pytest
 from painted import QUICK, SilentReport
 
-from benchmarks.validation import kept_score, read_log, read_trials, score_fit
+from benchmarks.validation import kept_score, read_log, read_trials, score_fit, tried_settings
 from hwp_bench.base.errors import BadInput
-from hwp_bench.base.records import merged
 from hwp_bench.capture import Capture
 from hwp_bench.capture.splits import contiguous_split
-from hwp_bench.cli.options import overrides
 from hwp_bench.methods import find_method, read_manifest
 from hwp_bench.methods.contract import Budget, TrainingCapture
 from hwp_bench.methods.manifest import shipped_methods
@@ -53,12 +51,14 @@ def test_each_baseline_has_as_many_trials_and_all_can_be_run(name: str) -> None:
     assert len(set(listed["trials"])) == 6
     manifest = read_manifest(find_method(name))
     make: Any = load_entry(manifest.root, str(manifest.entry.python))
-    preset = manifest.presets["smoke"]
-    made = [make(preset, 0).settings]
-    for text in listed["trials"]:
-        settings = make(merged(preset, overrides(text.split(","))), 0).settings
+    preset = manifest.presets["mini"]
+    made = []
+    for text in ["", *listed["trials"]]:
+        settings = make(tried_settings(preset, listed, text), 0).settings
         assert settings not in made
         made.append(settings)
+    # Its preset is what it had then, or the trial that took its place.
+    assert (make(preset, 0).settings == made[0]) == ("before" not in listed)
 
 
 def test_a_fit_is_made_once_and_found_in_the_log(tmp_path: Path) -> None:
