@@ -17,6 +17,7 @@ from hwp_bench.cli.main import main
 from hwp_bench.leaderboard.pages import (
     PICTURES,
     Sources,
+    against_each,
     find_faults,
     verdict_of,
     with_digest,
@@ -128,12 +129,30 @@ def test_the_field_has_the_means_and_differences_of_the_entries(checkout: Path) 
     assert cells(page, "Plain")[3].startswith(f"{lead:+.2f} (")
     assert cells(page, "Trimmed")[4] == "ahead"
     assert "The end.\n" in page
+    assert "significantly ahead of 1 of the 2 others, and behind none." in page
     assert "3 of the 15 methods that ship are complete here" in page
     assert "**Incomplete**: no complete run of " in page
     # 28.5 dB against 30.2 on the last capture; one dB ahead elsewhere.
     assert "on 1 of 8 captures: capture7 (-1.70 dB, Plain)" in page
     assert "- **Seeds**: 0, 1\n" in page
     assert "- **Budget**: 16 s\n" in page
+
+
+def test_a_method_ahead_of_each_other_one_is_said_to_be(tmp_path: Path) -> None:
+    """Leads of 2 or 4 dB on the plain fit spread more than those of 1 or 1.5 on Trimmed."""
+    scores = {"wildghand": (30.0, 0.0), "plain": (28.0, 2.0), "trimmed": (29.0, 0.5)}
+    made = [
+        complete_results(
+            name, lambda number, frame, a=a, b=b: a - b * (number % 2), suite_name="mini"
+        )
+        for name, (a, b) in scores.items()
+    ]
+    add_entries(tmp_path / PLACE, made)
+    (one,) = Sources(tmp_path).fields
+    found = re.escape(one.named["plain"].title)
+    assert re.search(
+        rf"ahead of all 2 others; least surely of {found}: \+3\.\d\d \(", against_each(one)
+    )
 
 
 def test_a_suite_has_a_picture_that_the_page_shows(checkout: Path) -> None:
