@@ -19,20 +19,20 @@ import numpy as np
 import torch
 
 import wildghand
+from benchmarks.turntable import camera_around
 from hwp_bench.base.colors import linear_to_srgb, srgb_to_linear
 from hwp_bench.base.drawing import labelled, sheet
-from hwp_bench.base.images import as_uint8, write_image
+from hwp_bench.base.images import write_image
 from hwp_bench.base.numerics import kd_tree
 from hwp_bench.base.tables import to_markdown
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.cli.options import named_table
 from hwp_bench.hands.anchors import SurfaceAnchors
-from hwp_bench.methods.contract import Camera
 from hwp_bench.sim.geometry.surface import normal_operator, surface_normals, unit
 from hwp_bench.sim.produce.capture import ensure_suite, suite
 from hwp_bench.sim.subject.hand import of_side, painted, subject_hand
 from hwp_bench.sim.subject.subject import Subject
-from wildghand.avatar.avatar import WildGHandAvatar, splat
+from wildghand.avatar.avatar import WildGHandAvatar, over, splat
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.visibility.count import facing_of
 
@@ -41,10 +41,12 @@ NEIGHBOURS = 12
 #: Least cosine between normal and camera of a Gaussian that a frame shows, and the share of the
 #: frames that must show it.
 FACING, SEEN = 0.3, 0.1
+#: Share of the back below which a place is of the palm.
+PALM = 0.3
 #: Frames that are looked at.
 FRAMES = 24
-# Edge of a picture, px; distance of its camera in radii of the hand; log error of the full colours.
-_SIZE, _AWAY, _FULL = 220, 6.0, 0.7
+# Edge of a picture, px; log error of the full colours.
+_SIZE, _FULL = 220, 0.7
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +105,7 @@ def learnt_albedo(
         viewmats = torch.as_tensor(capture.camera(frame).viewmat).float()[None]
         faces = (facing_of(anchors, viewmats)[0] > FACING).double().numpy()[:, None]
         colors = model.network.activation(made.raw).colors * made.shadow
-        colors = colors.reshape(-1, count, 3)[0].double().numpy()
+        colors = colors[0].double().numpy()
         shown, total = shown + faces, total + faces * srgb_to_linear(colors.clip(0.0, 1.0))
     return total / np.maximum(shown, 1.0), (shown / len(frames))[:, 0]
 
@@ -118,24 +120,17 @@ def compare_albedo(
     ratio = np.log(np.maximum(learnt, 1e-3) / np.maximum(true, 1e-3)).mean(axis=1)
     near = kd_tree(places[seen]).query(places, k=NEIGHBOURS)[1]
     smooth = ratio[seen][near].mean(axis=1)
-    return Albedo(learnt, true, seen, back < 0.3, smooth - np.median(smooth[seen]))
+    return Albedo(learnt, true, seen, back < PALM, smooth - np.median(smooth[seen]))
 
 
 def pictures(avatar: WildGHandAvatar, side: str, found: Albedo) -> list[np.ndarray]:
     """The palm at rest in true albedo, in learnt albedo, and its error: (H, W, 3) uint8 each."""
     hand = avatar.pose({side: avatar.rest_poses()[side]})
-    centre = 0.5 * (hand.means.min(axis=0) + hand.means.max(axis=0)).astype(float)
-    radius = float(np.linalg.norm(hand.means - centre, axis=1).max())
-    up, _, back = np.linalg.svd(hand.means - centre, full_matrices=False)[2]
+    means = hand.means.astype(float)
+    up, _, back = np.linalg.svd(means - means.mean(axis=0), full_matrices=False)[2]
     # The palm looks to where most of its anchors lie.
-    palm = hand.means[found.palm].mean(axis=0) - hand.means[~found.palm].mean(axis=0)
-    back = back * np.sign(back @ palm)
-    rows = np.stack([np.cross(up, back), -up, -back])
-    viewmat = np.eye(4)
-    viewmat[:3, :3], viewmat[:3, 3] = rows, -rows @ (centre + _AWAY * radius * back)
-    focal = 0.46 * _SIZE * _AWAY
-    K = np.array([[focal, 0.0, _SIZE / 2], [0.0, focal, _SIZE / 2], [0.0, 0.0, 1.0]])
-    camera = Camera(viewmat=viewmat, K=K, width=_SIZE, height=_SIZE)
+    palm = means[found.palm].mean(axis=0) - means[~found.palm].mean(axis=0)
+    camera = camera_around(means, up, back * np.sign(back @ palm), _SIZE)
     gain = np.exp(
         np.median(np.log(np.maximum(found.true, 1e-3)[found.seen]))
         - np.median(np.log(np.maximum(found.learnt, 1e-3)[found.seen]))
@@ -146,7 +141,7 @@ def pictures(avatar: WildGHandAvatar, side: str, found: Albedo) -> list[np.ndarr
     drawn = []
     for colors in (linear_to_srgb(found.true), linear_to_srgb(gain * found.learnt), tinted):
         rgba = splat(replace(hand, colors=colors.clip(0.0, 1.0).astype(np.float32)), camera)
-        drawn.append(as_uint8(rgba[..., :3] + 1.0 - rgba[..., 3:]))
+        drawn.append(over(rgba, (255, 255, 255)))
     return drawn
 
 

@@ -57,6 +57,26 @@ class View:
         return float(self.rgba[..., 3][outside].sum())
 
 
+def camera_around(points: np.ndarray, up: np.ndarray, back: np.ndarray, size: int) -> Camera:
+    """Return a square camera whose picture points fill.
+
+    Args:
+        points: (N, 3) m, world.
+        up: (3,) unit, the upward direction of the picture.
+        back: (3,) unit, from the points towards the camera.
+        size: edge of the picture, px.
+    """
+    centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    radius = float(np.linalg.norm(points - centre, axis=1).max())
+    focal = 0.5 * size * _FILL * _AWAY
+    K = np.array([[focal, 0.0, size / 2], [0.0, focal, size / 2], [0.0, 0.0, 1.0]])
+    rows = np.stack([np.cross(up, back), -up, -back])
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = rows
+    viewmat[:3, 3] = -rows @ (centre + _AWAY * radius * back)
+    return Camera(viewmat=viewmat, K=K, width=size, height=size)
+
+
 @torch.no_grad()
 def turn(avatar: WildGHandAvatar, side: str, size: int = 256) -> Iterator[View]:
     """Draw one hand at rest from `VIEWS` directions around its length, then around its breadth.
@@ -72,23 +92,14 @@ def turn(avatar: WildGHandAvatar, side: str, size: int = 256) -> Iterator[View]:
     vertices = pose_hand(rig.template, *given).vertices
     points = vertices[0].double().numpy()
     axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
-    centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
-    radius = float(np.linalg.norm(points - centre, axis=1).max())
-    focal = 0.5 * size * _FILL * _AWAY
-    K = np.array([[focal, 0.0, size / 2], [0.0, focal, size / 2], [0.0, 0.0, 1.0]])
     faces = rig.template.faces.numpy().astype(np.int64)
     for up in axes[:2]:
         for step in range(VIEWS):
             angle = 2.0 * math.pi * step / VIEWS
             back = math.cos(angle) * axes[2] + math.sin(angle) * np.cross(up, axes[2])
-            rows = np.stack([np.cross(up, back), -up, -back])
-            viewmat = np.eye(4)
-            viewmat[:3, :3] = rows
-            viewmat[:3, 3] = -rows @ (centre + _AWAY * radius * back)
-            rgba = avatar.render(
-                {side: pose}, Camera(viewmat=viewmat, K=K, width=size, height=size)
-            )
-            matrices = (torch.as_tensor(one).float()[None] for one in (viewmat, K))
+            camera = camera_around(points, up, back, size)
+            rgba = avatar.render({side: pose}, camera)
+            matrices = (torch.as_tensor(one).float()[None] for one in (camera.viewmat, camera.K))
             places, depth = project(vertices, *matrices)
             drawn = draw_faces(places[0].numpy(), depth[0].numpy(), faces, (size, size))[0]
             yield View(rgba, drawn >= 0)

@@ -51,7 +51,7 @@ def test_brightness_of_the_clip_is_no_error(monkeypatch: pytest.MonkeyPatch) -> 
 def test_a_dark_palm_is_an_error_of_the_palm(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where all neighbours are of the palm, or none, the two differ by the factor."""
     _, back, places = albedo.true_albedo(SUBJECT, "right", ANCHORS)
-    palm = back < 0.3
+    palm = back < albedo.PALM
     found = found_with(monkeypatch, np.where(palm, 0.5, 1.0))
     around = palm[cKDTree(places).query(places, k=albedo.NEIGHBOURS)[1]].mean(axis=1)
     inside, outside = found.error[around == 1.0], found.error[around == 0.0]
