@@ -44,6 +44,7 @@ def watching(args: argparse.Namespace, world: World) -> Iterator[tuple[Watch | N
 _FIT_EXAMPLES = """examples:
   wildghand fit hand.mp4 -o my_hand
   wildghand fit hand.mp4 -o my_hand --quick
+  wildghand fit sharp.mp4 -o my_hand --size 512
   wildghand fit my_capture -o my_avatar --budget 60
   wildghand fit my_capture -o my_avatar --live --port 9000
   wildghand fit my_capture -o paper --set mode=paper --set network.size=paper --set device=cuda
@@ -73,6 +74,8 @@ def _add_fit(parser: argparse.ArgumentParser) -> None:
     networks = "the tracker's networks, as `data track` takes"
     add("--model", type=Path, metavar="FILE", help=networks)
     add("--hand-model", metavar="MODEL", help="for a video: anny (default) or mano:PATH")
+    size = "of a video: edge of the frames that are fitted (default: 256; 512 for sharp videos)"
+    add("--size", type=int, metavar="PX", help=size)
     add_fitting(parser, "optimizer steps")
     add("--budget", type=float, metavar="SECONDS", help="limit of the fit's time")
     frames = "fit validation and test frames too (default: for a video yes, for a capture no)"
@@ -112,6 +115,7 @@ def _do_fit(args: argparse.Namespace) -> int:
 
 def _video(args: argparse.Namespace, world: World) -> int:
     from hwp_bench.base.console import notice
+    from hwp_bench.importers.video import VideoImport
     from wildghand.from_video import VideoFit, make_avatar
 
     options = VideoFit(
@@ -121,6 +125,7 @@ def _video(args: argparse.Namespace, world: World) -> int:
         tracker=args.model,
         quick=args.quick,
         all_frames=args.all_frames is not False,
+        size=VideoImport.size if args.size is None else args.size,
         steps=args.steps,
         seconds=args.budget,
         seed=args.seed,
@@ -163,7 +168,7 @@ def _capture(args: argparse.Namespace, world: World) -> int:
     from wildghand.fitting.session import fit_capture
     from wildghand.from_video.run import with_quick
 
-    for option in ("side", "landmarks", "model", "hand-model"):
+    for option in ("side", "landmarks", "model", "hand-model", "size"):
         if getattr(args, option.replace("-", "_")) is not None:
             raise UsageError(
                 "is for videos; a capture says it itself", where=args.source, field=f"--{option}"

@@ -16,6 +16,7 @@ from hwp_bench.base.errors import BadInput, UsageError, of_type, place, real_num
 from hwp_bench.base.folders import exclusive
 from hwp_bench.base.images import check_encoder
 from hwp_bench.capture import Capture, open_capture
+from hwp_bench.importers.video import VideoImport
 from hwp_bench.importers.video.decode import probe
 from hwp_bench.importers.video.glimpse import Glimpse
 from hwp_bench.methods.contract import Budget
@@ -160,10 +161,10 @@ def _check_folder(job: VideoJob, *, overwrite: bool) -> None:
     )
 
 
-# Bytes of a job, for each stored frame and for all the rest: on the disk, and in memory, where the
+# Bytes of a job, for each stored pixel and for all the rest: on the disk, and in memory, where the
 # import holds frames at twice the stored edge too.
-_DISK_FRAME, _DISK_REST = 400_000, 100_000_000
-_MEMORY_FRAME, _MEMORY_REST = 1_500_000, 1_500_000_000
+_DISK_PIXEL, _DISK_REST = 6, 100_000_000
+_MEMORY_PIXEL, _MEMORY_REST = 23, 1_500_000_000
 
 
 def _check_requirements(job: VideoJob) -> None:
@@ -173,10 +174,11 @@ def _check_requirements(job: VideoJob) -> None:
     if job.options.landmarks is None and not job.landmarks.is_file():
         LiteRtNetworks(load_models(job.options.tracker))
     frames = min(info.stated_frames or FRAMES, job.options.most_frames)
+    pixels = frames * job.options.size**2
     place = next(one for one in (job.folder, *job.folder.absolute().parents) if one.is_dir())
     left = {
-        "of disk": (_DISK_REST + _DISK_FRAME * frames, shutil.disk_usage(place).free),
-        "of memory": (_MEMORY_REST + _MEMORY_FRAME * frames, psutil.virtual_memory().available),
+        "of disk": (_DISK_REST + _DISK_PIXEL * pixels, shutil.disk_usage(place).free),
+        "of memory": (_MEMORY_REST + _MEMORY_PIXEL * pixels, psutil.virtual_memory().available),
     }
     for name, (needed, free) in left.items():
         if needed > free:
@@ -184,7 +186,7 @@ def _check_requirements(job: VideoJob) -> None:
                 f"{frames} frames need about {needed / 1e9:.1f} GB {name}, {free / 1e9:.1f} GB are "
                 "free",
                 where=place,
-                remedy="Make room, or take fewer frames with --quick.",
+                remedy="Make room, or take fewer frames with --quick, or a smaller --size.",
             )
 
 
@@ -207,6 +209,7 @@ def fit(
     overwrite: bool = False,
     side: str | None = None,
     landmarks: str | os.PathLike[str] | None = None,
+    size: int | None = None,
     tensorboard: str | os.PathLike[str] | None = None,
 ) -> WildGHandAvatar:
     """Fit an avatar to a video or to a capture, as `wildghand fit` does.
@@ -229,6 +232,7 @@ def fit(
         overwrite: replace an avatar that is there.
         side: of a video: `right`, `left`, `both` or `auto` (the default: one or both, as it shows).
         landmarks: of a video: its landmarks; None tracks them.
+        size: of a video: edge of the square frames that are fitted, px (default: 256).
         tensorboard: folder for curves of the fit, which `tensorboard --logdir` shows while it runs.
 
     Returns:
@@ -254,12 +258,14 @@ def fit(
     seconds = None if seconds is None else real_number(seconds, "seconds")
     steps = None if steps is None else whole_number(steps, "steps")
     seed = whole_number(seed, "seed")
+    size = None if size is None else whole_number(size, "size")
     if not isinstance(source, Capture) and is_video(source):
         options = VideoFit(
             side=side or "auto",
             landmarks=landmarks,
             quick=quick,
             all_frames=all_frames is not False,
+            size=VideoImport.size if size is None else size,
             steps=steps,
             seconds=seconds,
             seed=seed,
@@ -267,7 +273,7 @@ def fit(
         )
         with logging_fit(log) as watch:
             return make_avatar(source, out, options, overwrite=overwrite, watch=watch).avatar
-    for name, value in (("side", side), ("landmarks", landmarks)):
+    for name, value in (("side", side), ("landmarks", landmarks), ("size", size)):
         if value is not None:
             raise UsageError("is for videos; a capture says it itself", field=name)
     with logging_fit(log) as watch:

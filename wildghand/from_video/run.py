@@ -32,7 +32,7 @@ from hwp_bench.base.files import read_json, write_json
 from hwp_bench.base.records import Seconds, merged, parse_record
 from hwp_bench.capture.schema import METADATA, check_id
 from hwp_bench.importers.shared.output import CHOICES, check_choices
-from hwp_bench.importers.video import SolveSettings
+from hwp_bench.importers.video import SolveSettings, VideoImport
 from hwp_bench.importers.video.glimpse import Glimpse
 from wildghand.avatar.files import DESCRIPTION
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
@@ -42,6 +42,9 @@ from wildghand.model.settings import nested
 #: Most frames that are imported, spread over the video, by default and with `quick`: 20 s at 30
 #: frames a second, and a third of that.
 FRAMES, QUICK_FRAMES = 600, 200
+#: What the avatar of a video has in place of the method's settings: no Gaussians so wide that they
+#: draw a rim outside of the hand, which a score hardly sees and a person does.
+VIDEO: Mapping[str, Any] = MappingProxyType({"max_scale": 0.003})
 #: What `quick` changes of the method's settings: fewer Gaussians, fewer steps.
 QUICK: Mapping[str, Any] = MappingProxyType({"gaussians": 5000, "schedule": {"steps": 700}})
 
@@ -66,6 +69,8 @@ class VideoFit:
     quick: bool = False
     #: Fit every frame. False leaves the last fifth out, for a score.
     all_frames: bool = True
+    #: Edge of the square frames that are fitted, px.
+    size: int = VideoImport.size
     #: Numbers of the import's fit.
     importer: SolveSettings = field(default_factory=SolveSettings)
     #: Optimizer steps, or None for the settings' number.
@@ -75,12 +80,13 @@ class VideoFit:
     #: Seed of all random numbers.
     seed: int = 0
     #: Settings of the method, as `wildghand.model.settings.read_settings` takes them; they win
-    #: over those of `quick`.
+    #: over `VIDEO` and `QUICK`.
     settings: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_choices(
             ("--side", self.side in CHOICES, f"must be one of {', '.join(CHOICES)}"),
+            ("--size", 32 <= self.size <= 2048, "must be 32 to 2048 px"),
             ("--steps", self.steps is None or self.steps >= 1, "must be 1 or more"),
             ("--budget", self.seconds is None or self.seconds > 0.0, "must be more than 0"),
             ("--seed", self.seed >= 0, "must be 0 or more"),
@@ -92,8 +98,8 @@ class VideoFit:
         return QUICK_FRAMES if self.quick else FRAMES
 
     def method_settings(self) -> dict[str, Any]:
-        """Return the method's settings, with what `quick` changes."""
-        return with_quick(self.settings, quick=self.quick)
+        """Return the method's settings, with what a video and `quick` change."""
+        return with_quick(merged(VIDEO, nested(self.settings)), quick=self.quick)
 
 
 def with_quick(settings: Mapping[str, Any], *, quick: bool) -> dict[str, Any]:

@@ -219,6 +219,7 @@ class Import(Stage):
             "landmarks": sha256_of(job.landmarks),
             "side": job.options.side,
             "hand model": job.options.hand_model,
+            "size": str(job.options.size),
             "number of frames": str(job.options.most_frames),
             "settings of the import": canonical_json(asdict(job.options.importer)),
             "version of the importer": str(IMPORTER_VERSION),
@@ -244,6 +245,7 @@ def import_options(job: VideoJob) -> VideoImport:
     choices = VideoImport(
         side=job.options.side,
         id=job.capture_id,
+        size=job.options.size,
         hand_model=job.options.hand_model,
         overwrite=True,
         strict=True,

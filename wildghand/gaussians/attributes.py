@@ -103,6 +103,11 @@ class Attributes:
     colors: Tensor
 
 
+#: Largest standard deviation of a Gaussian, m, unless a fit says otherwise: one as wide as a finger
+#: explains nothing of a hand, and costs time.
+MAX_SCALE = 1e-2
+
+
 @dataclass(frozen=True)
 class Activation:
     """Turns raw attributes into attributes."""
@@ -114,8 +119,8 @@ class Activation:
     log_scale_bias: float = -5.0
     #: Smallest standard deviation, m; thinner than paper explains nothing of a hand.
     min_scale: float = 2e-5
-    #: Largest standard deviation, m; nor does a Gaussian as wide as a finger, and it costs time.
-    max_scale: float = 1e-2
+    #: Largest standard deviation, m.
+    max_scale: float = MAX_SCALE
 
     def __call__(self, raw: RawAttributes) -> Attributes:
         """Activate (..., N, k): bounded offsets and exponentials, unit quaternions, sigmoids."""

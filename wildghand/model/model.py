@@ -482,7 +482,9 @@ def make_model(
         side: surface_points(templates[side], rig.anchors, rig.spacing, mean_color)
         for side, rig in rigs.items()
     }
-    network = PredictionNetwork(settings.network.build(), surfaces, seed)
+    network = PredictionNetwork(
+        settings.network.build(), surfaces, seed, max_scale=settings.max_scale
+    )
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         dpd = settings.dpd

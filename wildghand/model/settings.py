@@ -16,6 +16,7 @@ from hwp_bench.base.errors import BadMethod, nearest
 from hwp_bench.base.records import flattened, merged
 from hwp_bench.methods.settings import check_source, choice, number, settings_from
 from wildghand.dpd.dpd import DpdSettings
+from wildghand.gaussians.attributes import MAX_SCALE
 from wildghand.model.terms import TermSettings
 from wildghand.network.settings import SIZES, NetworkSettings, network_settings
 from wildghand.pao.pao import PaoSettings
@@ -102,6 +103,9 @@ class WildGHandSettings:
     start_colors: bool = True
     #: Gaussians on each hand.
     gaussians: int = number(12_337, 1, 1_000_000)
+    #: Largest standard deviation of a Gaussian, m. `wildghand fit VIDEO` has 0.003: wider ones draw
+    #: a rim outside of the hand.
+    max_scale: float = number(MAX_SCALE, 1e-4, 0.1)
     #: `auto` (CUDA where both a GPU and gsplat are there), `cpu` or `cuda`.
     device: str = choice("auto", "cpu", "cuda")
     #: Mixed precision of the network; CUDA only.

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from hwp_bench.base.errors import ShapeMismatch, UsageError
-from wildghand.gaussians.attributes import Activation, RawAttributes
+from wildghand.gaussians.attributes import MAX_SCALE, Activation, RawAttributes
 from wildghand.network.branches import CompactGeometry, CompactTexture, PaperGeometry, PaperTexture
 from wildghand.network.heads import (
     AttributeHead,
@@ -88,13 +88,19 @@ class PredictionNetwork(nn.Module):
         surfaces: the anchors of each hand, by side.
         seed: of the initial weights; the same seed gives the same network bit for bit, and the
             global random state stays as it is.
+        max_scale: largest standard deviation of a Gaussian, m.
 
     Raises:
         UsageError: no hand, or one that is neither right nor left.
     """
 
     def __init__(
-        self, settings: NetworkSettings, surfaces: Mapping[str, SurfacePoints], seed: int = 0
+        self,
+        settings: NetworkSettings,
+        surfaces: Mapping[str, SurfacePoints],
+        seed: int = 0,
+        *,
+        max_scale: float = MAX_SCALE,
     ) -> None:
         super().__init__()
         check_sides(surfaces)
@@ -102,7 +108,7 @@ class PredictionNetwork(nn.Module):
         #: Multiply matrices in bfloat16. What comes out is float32 all the same.
         self.mixed_precision = False
         #: Turns raw attributes into drawable ones.
-        self.activation = Activation(max_offset=settings.max_offset)
+        self.activation = Activation(max_offset=settings.max_offset, max_scale=max_scale)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.identity = IdentityMap(settings, sorted(surfaces))

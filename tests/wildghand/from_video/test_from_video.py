@@ -34,6 +34,7 @@ from wildghand.cli.main import main
 from wildghand.from_video import VideoFit, make, make_avatar, stages
 from wildghand.from_video.run import QUICK as QUICK_CHANGES
 from wildghand.from_video.run import QUICK_FRAMES, VideoJob, with_quick
+from wildghand.from_video.run import VIDEO as VIDEO_CHANGES
 from wildghand.from_video.stages import STAGES, import_options, stride
 from wildghand.model.settings import read_settings
 
@@ -142,6 +143,7 @@ def test_the_same_command_keeps_everything(folder: Path, capsys) -> None:
     [
         ({"seed": 1}, NAMES[2:], "seed"),
         ({"all_frames": False}, NAMES[2:], "choice of frames"),
+        ({"size": 128}, NAMES[1:], "size"),
         # The side that is named is the one that was found: the capture stays what it was, and so
         # does all that depends on it.
         ({"side": "right"}, ["import"], "side"),
@@ -302,7 +304,9 @@ def test_from_python(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         (["hand.avi", "--steps", "0"], 2, "--steps"),
         (["hand.avi", "--set", "gausians=3"], 1, "gaussians"),
         (["hand.avi", "--landmarks", "absent.npz"], 1, "absent.npz"),
+        (["hand.avi", "--size", "16"], 2, "--size"),
         (["taken", "--side", "left", "-o", "x"], 2, "--side: is for videos"),
+        (["taken", "--size", "512", "-o", "x"], 2, "--size: is for videos"),
         (["taken", "--hand-model", "mano:/etc", "-o", "x"], 2, "--hand-model: is for videos"),
         (["taken"], 2, "--out: is missing"),
     ],
@@ -437,6 +441,20 @@ def test_a_real_hand(tmp_path: Path) -> None:
     assert result.job.folder == tmp_path / "hand_avatar"
     assert result.avatar.sides == ("right",)
     assert result.job.turntable.is_file()
+
+
+def test_no_gaussian_of_a_video_is_wide(made: Path) -> None:
+    """Oracle: the bound. A person's word wins over it, with and without `quick`."""
+    model = load_avatar(made / "my_hand").model
+    limit = model.network.activation.max_scale
+    assert limit == VIDEO_CHANGES["max_scale"] < read_settings({}).max_scale
+    raw = model.network.initial("right")
+    wide = replace(raw, log_scales=torch.full_like(raw.log_scales, 9.0))
+    assert model.network.activation(wide).scales.max() <= limit * (1 + 1e-6)
+    for quick in (False, True):
+        assert VideoFit(quick=quick).method_settings()["max_scale"] == limit
+        said = VideoFit(quick=quick, settings={"max_scale": 0.005})
+        assert read_settings(said.method_settings()).max_scale == 0.005
 
 
 def test_quick_takes_fewer_frames_and_smaller_fits() -> None:
