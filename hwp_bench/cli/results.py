@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 _TABLES = (
     *("overall", "rank", "cost", "captures", "perturbations", "details", "micro", "paper"),
     *("robustness", "severity", "clean-share", "novelty", "outline", "free-view", "bias", "seeds"),
-    "discrimination",
+    *("sharpness", "discrimination"),
 )
 _TABLE = """examples:
   hwp-bench table runs/plain-mini
@@ -44,6 +44,7 @@ _TABLE = """examples:
   hwp-bench table runs/mine-persistent* runs/plain-persistent* --by clean-share --figure runs
   hwp-bench table runs/plain-mini runs/mine-mini --by novelty   # where training showed little
   hwp-bench table runs/plain-mini runs/mine-mini --by outline   # what is drawn outside of the hand
+  hwp-bench table runs/plain-mini runs/mine-mini --by sharpness   # fine structure, by wavelength
   hwp-bench table runs/plain-mini runs/mine-mini --by free-view   # from all around
   hwp-bench table runs/mine-mini runs/plain-mini --paper 5 --published   # layout of table 5
   hwp-bench table --published                                            # the paper's numbers
@@ -71,7 +72,7 @@ def _add_table(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help="robustness: method from which the gap is counted; discrimination: the ceiling",
     )
-    add_capture_folders(parser, "severities, clean shares, novelty and outlines")
+    add_capture_folders(parser, "severities, clean shares, novelty, outlines and sharpness")
     forms = ("terminal", "md", "tex", "csv", "json")
     text = "format of the table (default terminal)"
     add("--format", choices=forms, default="terminal", help=text)

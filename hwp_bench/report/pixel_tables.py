@@ -1,10 +1,12 @@
-"""Tables that look at predictions again: by novelty of the pixels, and by what is drawn outside."""
+"""Tables that look at predictions again.
+
+By novelty of the pixels, by what is drawn outside, and by how sharp it is.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from statistics import fmean
 from typing import NamedTuple
 
 import cv2
@@ -309,18 +311,8 @@ def outline_table(sources: Sequence[ResultsSource], captures: Mapping[str, Captu
     Frames without a sound prediction are left out, and captures that are not at hand for every
     method.
     """
-    found: list[list[OutlineScores]] = [[] for _ in sources]
-    for digest, capture in track(captures.items(), "Outlines", len(captures)):
-        if means := _means(sources, digest, capture):
-            for scores, mean in zip(found, means, strict=True):
-                scores.append(mean)
-    if not found or not found[0]:
-        raise UsageError(
-            "none of these captures is at hand with the predictions of every method",
-            field="--capture",
-            remedy="Name the capture folders, and results folders that hold predictions.",
-        )
-    means = [_mean(scores) for scores in found]
+    found = _score_again(sources, captures, "Outlines", outline_scores)
+    means = [OutlineScores(*np.mean(scores, axis=0)) for scores in found]
     columns: list[Filled] = [
         (Column("Method"), labels([source.results for source in sources])),
         (Column("PSNR [dB]", 2, True), [mean.psnr for mean in means]),
@@ -331,7 +323,125 @@ def outline_table(sources: Sequence[ResultsSource], captures: Mapping[str, Captu
     return table_of("By outline", columns, _NOTES)
 
 
-def _means(sources: Sequence[ResultsSource], digest: str, capture: Capture) -> list[OutlineScores]:
+#: Standard deviations of the blurs whose differences are the bands, px.
+BLURS = (0.0, 1.0, 2.0, 4.0)
+#: The bands: what the first blur takes away, then those with the strongest wavelength, px, between
+#: two neighbours (6.5 times the smaller standard deviation).
+BANDS = ("finer than 5 px", "6.5 px", "13 px")
+# Mean square of a band, in units of 1, below which the truth has nothing to draw: 8 bits cause it.
+_NOTHING = 0.25 / 255.0**2
+
+
+class BandPower(NamedTuple):
+    """One frame's mean products over the scored pixels, by band."""
+
+    #: (B,) of the prediction with itself, of the truth with itself, and of the two.
+    drawn: np.ndarray
+    true: np.ndarray
+    both: np.ndarray
+
+
+def band_power(
+    prediction: np.ndarray, target: np.ndarray, mask: np.ndarray, *, coverage: bool = False
+) -> BandPower | None:
+    """Measure the bands of two images of a hand.
+
+    What is outside of the scored pixels has no effect: blurs are means over those inside.
+
+    Args:
+        prediction: (H, W, 3) uint8 sRGB.
+        target: (H, W, 3) uint8.
+        mask: (H, W) uint8 or bool, the data set's own visible-hand mask.
+    """
+    check_truth(target, mask)
+    check_prediction(prediction, target)
+    region = scored_pixels(mask, erosion=HWP_V1.mask_erosion, coverage=coverage)
+    if not region.any():
+        return None
+    drawn, true = _bands(prediction, region), _bands(target, region)
+    return BandPower(*(_products(*pair) for pair in ((drawn, drawn), (true, true), (drawn, true))))
+
+
+def _bands(image: np.ndarray, region: np.ndarray) -> np.ndarray:
+    """(B, P, 3) float64: the bands at the pixels of a region, in units of 1."""
+    inside = region.astype(np.float64)
+    values = composite(image, region) / 255.0
+    levels = [values[region]]
+    for sigma in BLURS[1:]:
+        weight = cv2.GaussianBlur(inside, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT)
+        blurred = cv2.GaussianBlur(values, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT)
+        levels.append(blurred[region] / weight[region][:, None])
+    return -np.diff(np.stack(levels), axis=0)
+
+
+def _products(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    found: np.ndarray = (one * other).mean(axis=(1, 2))
+    return found
+
+
+_SHARP_NOTES = (
+    "Bands of the scored pixels: what a Gaussian blur of 1 px removes, and what lies between blurs "
+    "of 1 and 2 and of 2 and 4 px, named by the strongest wavelength.",
+    "Spectrum ratio: amplitude of the drawn band over the truth's; below 1 is too smooth, above 1 "
+    "has what the truth has not. Correlation: 1 where the drawn structure is the truth's. Pooled "
+    "over the frames of a capture, then means over captures.",
+    "The noise of a camera counts as structure of the truth.",
+)
+
+
+def sharpness_table(sources: Sequence[ResultsSource], captures: Mapping[str, Capture]) -> Table:
+    """Return one row per method: how much of the truth's fine structure it draws, band by band.
+
+    Frames without a sound prediction are left out, and captures that are not at hand for every
+    method, or whose truth has nothing in a band.
+    """
+    found = _score_again(sources, captures, "Sharpness", band_power)
+    # (methods, captures, 3, B)
+    power = np.array(found)
+    textured = (power[0, :, 1] > _NOTHING).all(axis=1)
+    if not textured.any():
+        raise UsageError("the hands of these captures have no structure", field="--capture")
+    drawn, true, both = np.moveaxis(power[:, textured], 2, 0)
+    ratio = np.sqrt(drawn / true).mean(axis=1)
+    correlation = (both / np.sqrt(np.maximum(drawn * true, _NOTHING**2))).mean(axis=1)
+    columns: list[Filled] = [(Column("Method"), labels([source.results for source in sources]))]
+    for group, values, better in (
+        ("Spectrum ratio", ratio, None),
+        ("Correlation", correlation, True),
+    ):
+        for index, name in enumerate(BANDS):
+            column = Column(name, 2, better, group)
+            columns.append((column, [float(value) for value in values[:, index]]))
+    return table_of("By sharpness", columns, _SHARP_NOTES)
+
+
+def _score_again(
+    sources: Sequence[ResultsSource],
+    captures: Mapping[str, Capture],
+    what: str,
+    score: Callable[..., Sequence[float | np.ndarray] | None],
+) -> list[list[np.ndarray]]:
+    """Each method's means over the test frames of every capture that all methods have."""
+    found: list[list[np.ndarray]] = [[] for _ in sources]
+    for digest, capture in track(captures.items(), what, len(captures)):
+        if means := _means(sources, digest, capture, score):
+            for scores, mean in zip(found, means, strict=True):
+                scores.append(mean)
+    if not found or not found[0]:
+        raise UsageError(
+            "none of these captures is at hand with the predictions of every method",
+            field="--capture",
+            remedy="Name the capture folders, and results folders that hold predictions.",
+        )
+    return found
+
+
+def _means(
+    sources: Sequence[ResultsSource],
+    digest: str,
+    capture: Capture,
+    score: Callable[..., Sequence[float | np.ndarray] | None],
+) -> list[np.ndarray]:
     """Each method's means over the test frames of a capture; empty where one has none to score."""
     runs = [
         {
@@ -343,7 +453,7 @@ def _means(sources: Sequence[ResultsSource], digest: str, capture: Capture) -> l
     ]
     if not all(runs):
         return []
-    scores: list[list[OutlineScores]] = [[] for _ in sources]
+    scores: list[list[np.ndarray]] = [[] for _ in sources]
     # Each frame is read once for all methods.
     for frame in sorted({frame for files in runs for frame in files}):
         target, (mask, exact) = capture.frame(frame), capture.scoring_mask(frame)
@@ -351,11 +461,7 @@ def _means(sources: Sequence[ResultsSource], digest: str, capture: Capture) -> l
             if frame not in files:
                 continue
             prediction = read_rgb(files[frame], capture.size)
-            one = outline_scores(prediction, target, mask, coverage=exact)
+            one = score(prediction, target, mask, coverage=exact)
             if one is not None:
-                mine.append(one)
-    return [_mean(mine) for mine in scores] if all(scores) else []
-
-
-def _mean(scores: Sequence[OutlineScores]) -> OutlineScores:
-    return OutlineScores(*map(fmean, zip(*scores, strict=True)))
+                mine.append(np.array(one))
+    return [np.mean(mine, axis=0) for mine in scores] if all(scores) else []

@@ -22,7 +22,7 @@ from hwp_bench.report.paper_layouts import (
     layout_table,
     seeds_layout,
 )
-from hwp_bench.report.pixel_tables import novelty_table, outline_table
+from hwp_bench.report.pixel_tables import novelty_table, outline_table, sharpness_table
 from hwp_bench.report.sources import (
     DataGroup,
     ResultsSource,
@@ -70,10 +70,12 @@ class TableRequest:
     published: bool = False
     #: Name of the method that the robustness table counts from, or that is the ceiling.
     base: str | None = None
-    #: Capture folders, for severities, novelty and outlines.
+    #: Capture folders, for severities and tables that look at predictions.
     captures: Sequence[str | os.PathLike[str]] = ()
 
 
+# Tables that look at predictions again.
+_PIXEL_TABLES = {"novelty": novelty_table, "outline": outline_table, "sharpness": sharpness_table}
 #: Tables that show each method, settings and seed once.
 _ONCE = ("rank", "discrimination", "cost", "seeds", "robustness", "free-view", "clean-share")
 
@@ -137,9 +139,9 @@ def _group_table(sources: Sequence[ResultsSource], request: TableRequest) -> Tab
             return bias_table(sources, find_captures(results, request.captures))
         case "severity":
             table = severity_table(sources, find_captures(results, request.captures))
-        case "novelty" | "outline":
+        case "novelty" | "outline" | "sharpness":
             captures = open_captures_of(results, request.captures)
-            table = (novelty_table if by == "novelty" else outline_table)(sources, captures)
+            table = _PIXEL_TABLES[by](sources, captures)
         case "seeds":
             table = seeds_table(sources)
         case "cost":

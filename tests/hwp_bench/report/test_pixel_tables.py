@@ -20,9 +20,11 @@ from hwp_bench.hands.articulation import axis_angle_to_matrix
 from hwp_bench.metrics.protocol import PSNR_CAP
 from hwp_bench.metrics.score import score_frame
 from hwp_bench.report.pixel_tables import (
+    BLURS,
     CLASSES,
     LIT,
     Novelty,
+    band_power,
     classes_of,
     measure_novelty,
     outline_scores,
@@ -198,6 +200,98 @@ def test_a_frame_without_scored_pixels_and_one_of_another_size() -> None:
     assert outline_scores(truth, truth, nothing, coverage=True) is None
     with pytest.raises(ShapeMismatch):
         outline_scores(truth[:-1], truth, coverage_of(truth), coverage=True)
+
+
+MIDDLE = coverage_of(square(48))
+
+
+def waves(length: float, amplitude: float = 30.0, shift: float = 0.0) -> np.ndarray:
+    """Grey stripes of one wavelength, px, as a whole frame."""
+    phase = 2 * np.pi * (np.arange(SIZE) + shift) / length
+    line = np.rint(128 + amplitude * np.sin(phase)).astype(np.uint8)
+    return np.repeat(np.broadcast_to(line, (SIZE, SIZE))[..., None], 3, axis=2)
+
+
+def ratio_and_correlation(
+    prediction: np.ndarray, truth: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    found = band_power(prediction, truth, MIDDLE)
+    assert found is not None
+    return np.sqrt(found.drawn / found.true), found.both / np.sqrt(found.drawn * found.true)
+
+
+@pytest.mark.parametrize(("length", "strongest"), [(3.0, 0), (6.5, 1), (13.0, 2)])
+def test_a_band_holds_its_wavelength(length: float, strongest: int) -> None:
+    """Oracle: the transfer function of a Gaussian blur, exp(-2 (pi sigma / wavelength)^2)."""
+    found = band_power(waves(length), waves(length), MIDDLE)
+    assert found is not None
+    passed = np.exp(-2 * (np.pi * np.array(BLURS) / length) ** 2)
+    expected = 0.5 * (30 / 255 * -np.diff(passed)) ** 2
+    # Blurs at the border of the region are means over fewer pixels.
+    np.testing.assert_allclose(found.true[strongest], expected[strongest], rtol=0.12)
+    assert found.true.argmax() == expected.argmax() == strongest
+
+
+def test_half_the_contrast_is_half_the_ratio_and_a_shift_is_no_structure() -> None:
+    ratio, correlation = ratio_and_correlation(waves(6.5, 20.0), waves(6.5, 40.0))
+    np.testing.assert_allclose(ratio[1], 0.5, atol=0.01)
+    np.testing.assert_allclose(correlation[1], 1.0, atol=0.01)
+    ratio, correlation = ratio_and_correlation(waves(6.5, 40.0, shift=6.5 / 4), waves(6.5, 40.0))
+    np.testing.assert_allclose(ratio[1], 1.0, atol=0.05)
+    assert abs(correlation[1]) < 0.1
+
+
+def test_noise_is_amplitude_without_structure() -> None:
+    """Oracle: independent noise adds its power, and lowers the correlation to 1 / ratio."""
+    truth = waves(4.0, 20.0)
+    noise = np.random.default_rng(0).normal(0.0, 20.0, truth.shape)
+    noisy = np.clip(truth + noise, 0, 255).astype(np.uint8)
+    ratio, correlation = ratio_and_correlation(noisy, truth)
+    assert ratio[0] > 1.2
+    np.testing.assert_allclose(correlation[0], 1.0 / ratio[0], rtol=0.1)
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_pixels_outside_of_the_mask_and_the_brightness_are_no_structure(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    one, other = random.integers(0, 256, (2, SIZE, SIZE, 3), dtype=np.uint8)
+    inside = (MIDDLE > 0)[..., None]
+    first, second = (
+        band_power(one, one, MIDDLE),
+        band_power(np.where(inside, one, other), one, MIDDLE),
+    )
+    assert first is not None
+    assert second is not None
+    np.testing.assert_array_equal(first, second)
+    plain = np.full_like(one, random.integers(0, 256))
+    flat = band_power(plain, one, MIDDLE)
+    assert flat is not None
+    np.testing.assert_allclose(flat.drawn, 0.0, atol=1e-20)
+
+
+def test_who_draws_sharper_is_seen(
+    make_painted: Callable[..., Capture], make_results: Callable[..., Results], tmp_path: Path
+) -> None:
+    capture = make_painted()
+
+    def blurred(sigma: float) -> Callable[[int], np.ndarray]:
+        return lambda frame: cv2.GaussianBlur(capture.frame(frame), (0, 0), sigma)
+
+    draws = {"exact": capture.frame, "soft": blurred(0.7), "softer": blurred(1.5)}
+    folders = [
+        drawn_results(capture, tmp_path / name, make_results(name), draw)
+        for name, draw in draws.items()
+    ]
+    table = make_table(TableRequest(folders, by="sharpness", captures=[capture.root]))
+    assert [column.group for column in table.columns] == ["", *["Spectrum ratio"] * 3] + (
+        ["Correlation"] * 3
+    )
+    rows = {row[0]: np.array(row[1:], dtype=float) for row in table.rows}
+    np.testing.assert_allclose(rows["Exact"], 1.0, atol=1e-12)
+    assert (rows["Softer"][:3] < rows["Soft"][:3]).all()
+    assert (rows["Soft"][:3] < 1.0).all()
+    with pytest.raises(UsageError, match="none of these captures"):
+        make_table(TableRequest(folders, by="sharpness"))
 
 
 def test_classes_are_those_of_the_edges() -> None:
