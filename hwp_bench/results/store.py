@@ -73,8 +73,8 @@ def _read(path: Path) -> tuple[Results, Mapping[str, Any]]:
 def result_files(path: str | os.PathLike[str]) -> list[Path]:
     """Return the result files that a path stands for.
 
-    It is a `results.json`, a results folder, an `ablation.json`, an ablation's folder, or the
-    folder of several methods and seeds.
+    It is a `results.json`, a results folder, an `ablation.json`, an ablation's folder, the folder
+    of several methods and seeds, or that of one of these methods.
     """
     place = Path(path)
     if several := _several(place):
@@ -96,8 +96,10 @@ def seed_folder(folder: Path, method: str, seed: int) -> Path:
 
 
 def _several(place: Path) -> list[Path]:
-    """Return the result files in a folder of several methods and seeds; none of any other."""
-    return [] if _single(place) else sorted(place.glob("*/seed-*/results.json"))
+    """Return the result files of several methods and seeds, or of one's seeds; none of others."""
+    if _single(place):
+        return []
+    return sorted(place.glob("seed-*/results.json")) or sorted(place.glob("*/seed-*/results.json"))
 
 
 def _single(folder: Path) -> bool:

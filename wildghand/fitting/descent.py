@@ -122,7 +122,7 @@ def make_optimizer(
     }
     groups["dpd"] = list(model.perturbation.parameters())
     groups |= {name: list(group) for name, group in others.items()}
-    groups["gains"] = [model.log_gains]
+    groups["gains"] = [model.log_gains] if model.log_gains.requires_grad else []
     groups["pose"] = [model.pose_steps]
     groups["transl"] = [model.transl_steps]
     fast = schedule.rates == "fast"

@@ -74,6 +74,7 @@ class WildGHandModel(nn.Module):
         embedding: width of the temporal embedding.
         rank: of the field of biases; 0: none.
         poses: the frames' poses are corrected by their temporal embedding.
+        gains: each frame has a gain of its own on its colours.
         template: apply the network's displacement of the template (head iii).
 
     Attributes:
@@ -98,6 +99,7 @@ class WildGHandModel(nn.Module):
         embedding: int = 256,
         rank: int = 0,
         poses: bool = False,
+        gains: bool = False,
         template: bool = True,
     ) -> None:
         super().__init__()
@@ -118,7 +120,8 @@ class WildGHandModel(nn.Module):
         )
         for side, rig in self.rigs.items() if dpd and rank else ():
             self.register_buffer(f"bones_{side}", bone_features(rig), persistent=False)
-        self.log_gains = nn.Parameter(torch.zeros(frame_count, 3))
+        # Without the additions of DPD nothing would hold them, and the hand's own colour would drift.
+        self.log_gains = nn.Parameter(torch.zeros(frame_count, 3), requires_grad=gains)
         self.pose_steps = nn.Parameter(torch.zeros(len(rigs), frame_count, 16, 3))
         self.transl_steps = nn.Parameter(torch.zeros(len(rigs), frame_count, 3))
 
@@ -495,6 +498,7 @@ def make_model(
             dpd=dpd.enabled,
             rank=dpd.rank if dpd.additions else 0,
             poses=dpd.poses,
+            gains=dpd.enabled and dpd.additions,
             template=settings.heads,
         )
     if subject is not None:
