@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import pickle
 import shutil
 import subprocess
@@ -158,9 +157,3 @@ def _write_video(folder: Path) -> None:
         world=np.repeat(0.03 * random.normal(size=(1, 21, 3)), 6, 0),
         score=np.ones(6),
     )
-
-
-def facts(folder: Path) -> str:
-    """What the seeds are, for the head of a report."""
-    files = [path for path in folder.rglob("*") if path.is_file()]
-    return json.dumps({"files": len(files), "bytes": sum(path.stat().st_size for path in files)})

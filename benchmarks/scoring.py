@@ -27,8 +27,6 @@ DISTINCT = 16
 ROUNDS = 5
 #: The plain loop gets one frame in so many; its time is multiplied.
 PLAIN_SHARE = 10
-#: Seconds that 1,000 frames of 256 px may take on two idle cores where the hand fills the frame.
-BUDGET_S = 15.0
 #: Processor time of ours over that of the plain loop, by the share that the hand fills.
 BUDGETS = {0.25: 0.5, 1.0: 0.85}
 

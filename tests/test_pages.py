@@ -21,8 +21,6 @@ PAGES = sorted({path.stem for path in DOCS.glob("*.md")} - GENERATED)
 #: Most words of a page, of the pages of users together, and of all studies; no blocks of code.
 LONGEST_PAGE, ALL_PAGES, ALL_STUDIES = 2_000, 25_000, 15_000
 LONGEST_SENTENCE, MEAN_SENTENCE = 45, 30
-STUDIES = 25_000, 15_000
-LONGEST_SENTENCE, MEAN_SENTENCE = 45, 30
 STUDIES = sorted((DOCS / "studies").glob("*.md"))
 
 #: Phrases to avoid, and what is usual in their place.

@@ -31,7 +31,7 @@ _MAKE = """examples:
 
 The scenes of the suites are public, so that a method which brings its own copy of the simulator can
 draw their test frames. In a sealed suite every person and every seed follow from a secret.
-docs/submissions.md says who publishes what, and when.
+docs/challenge.md says who publishes what, and when.
 exam/publication/public goes to authors; publish exam/publication/public/suite.json before anybody
 submits, because it binds you. exam/keeper holds the secret and the captures, and
 exam/publication/sealed the test frames: keep both. A start that was stopped continues.

@@ -17,6 +17,8 @@ from hwp_bench.suites.suite import lost_clips
 
 #: Share of its seconds before which a fit ends early.
 EARLY = 0.5
+#: Share of a core below which a timed fit has shared it with something else.
+ALONE = 0.9
 #: Most frames of a capture, or fits, that are named; the others are counted.
 SHOWN = 12
 
@@ -35,9 +37,11 @@ def outcome_lines(out: Path, results: Results, head: str = "") -> list[str]:
             lines.append(f"log: {folder / LOG}")
         lines += [f"warning: {head}{capture.id}: {text}" for text in read_warnings(folder)]
     lines += [f"warning: {head}{results.suite} {text}" for text in lost_clips(results)]
-    early = early_text(results)
+    early, shared = early_text(results), shared_text(results)
     if early:
         lines.append(f"warning: {head}{early}; see {LOG} in their folders")
+    if shared:
+        lines.append(f"warning: {head}{shared}; run timed fits on an idle machine")
     return lines + [
         text for text in (times_text(results, head), isolation_text(results, head)) if text
     ]
@@ -89,9 +93,31 @@ def early_text(results: Results) -> str:
     ]
     if not early:
         return ""
-    named = [*early[:SHOWN], *[f"and {len(early) - SHOWN} more"] * (len(early) > SHOWN)]
     count, total = len(early), len(results.captures)
-    return f"{count} of {total} fits ended early in {seconds:g} s: {', '.join(named)}"
+    return f"{count} of {total} fits ended early in {seconds:g} s: {_first_of(early)}"
+
+
+def shared_text(results: Results) -> str:
+    """Name the fits on the CPU, of so many seconds, that had less than a core; else empty."""
+    if results.budget.get("seconds") is None:
+        return ""
+    shared = [
+        f"{one.id} ({100 * one.cpu_seconds / one.fit_seconds:.0f} %)"
+        for one in results.captures
+        if one.device == "cpu" and one.cpu_seconds and one.fit_seconds
+        if one.cpu_seconds < ALONE * one.fit_seconds
+    ]
+    if not shared:
+        return ""
+    count, total = len(shared), len(results.captures)
+    return (
+        f"{count} of {total} fits had less than {100 * ALONE:.0f} % of a core: {_first_of(shared)}"
+    )
+
+
+def _first_of(names: Sequence[str]) -> str:
+    left = len(names) - SHOWN
+    return ", ".join([*names[:SHOWN], *[f"and {left} more"] * (left > 0)])
 
 
 def times_text(results: Results, head: str = "") -> str:

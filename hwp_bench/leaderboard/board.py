@@ -100,9 +100,10 @@ class BoardRow:
 
     @cached_property
     def scores(self) -> Mapping[str, float]:
-        """Headline scores by metric, means over the seeds."""
+        """Headline scores by metric, means over the seeds; of metrics that every seed has."""
         found = [entry.counted.scores for entry in self.entries]
-        return {name: sum(one[name] for one in found) / len(found) for name in found[0]}
+        names = [name for name in found[0] if all(name in one for one in found)]
+        return {name: sum(one[name] for one in found) / len(found) for name in names}
 
     @cached_property
     def scopes(self) -> Mapping[str, Mapping[str, float | None]]:

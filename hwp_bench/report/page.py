@@ -335,7 +335,7 @@ def write_reports(
         return [write(folder, sources, base)]
     names = [{source.results.method.name for source in group.sources} for group in groups]
     if base is not None and not any(base in known for known in names):
-        raise UsageError(f"no result is of {base!r}", field="--base")
+        raise UsageError(f"no result is of {base!r}", field="--baseline")
     pages, rows = [], []
     for group, known in zip(groups, names, strict=True):
         pages.append(write(folder / group.label, group.sources, base if base in known else None))

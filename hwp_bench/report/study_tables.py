@@ -159,7 +159,7 @@ def robustness_table(sources: Sequence[ResultsSource], base: str | None = None) 
         "Clean: the same method fitted on the clean frames of the same captures, the most that "
         "it can reach. Change: perturbed against clean.",
         "Gap closed: of the way from "
-        + (f"{start.first.method.title} on perturbed frames" if start else "a base (--base)")
+        + (f"{start.first.method.title} on perturbed frames" if start else "a base (--baseline)")
         + " to that oracle, the share that the method goes. Macro means.",
     )
     return table_of("Robustness", columns, notes)
@@ -184,7 +184,9 @@ def _base(perturbed: Sequence[MethodRuns], name: str | None) -> MethodRuns | Non
             return run
     known = ", ".join(sorted({run.first.method.name for run in perturbed}))
     raise UsageError(
-        f"no result on perturbed frames is of {name!r}", field="--base", remedy=f"Given: {known}."
+        f"no result on perturbed frames is of {name!r}",
+        field="--baseline",
+        remedy=f"Given: {known}.",
     )
 
 
@@ -303,7 +305,7 @@ def refused_bias() -> UsageError:
     return UsageError(
         "none of these methods left temporal weights",
         field="RESULTS",
-        remedy="A method leaves them in diagnostics/temporal.json; docs/tables.md says how.",
+        remedy="A method leaves them in its diagnostics; docs/methods.md says how.",
     )
 
 
@@ -340,7 +342,7 @@ def discrimination_table(runs: Sequence[MethodRuns], base: str | None = None) ->
     ceilings = [run for run in runs if run.first.method.name == base]
     methods = [run for run in runs if run not in ceilings]
     if base is not None and not ceilings:
-        raise UsageError(f"no result is of {base!r}", field="--base")
+        raise UsageError(f"no result is of {base!r}", field="--baseline")
     if len(methods) < 2:
         raise UsageError("several methods are needed", field="RESULTS")
     rows: list[tuple[Cell, ...]] = []

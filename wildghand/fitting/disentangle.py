@@ -20,9 +20,12 @@ from wildghand.model.frames import RenderedFrames
 class Dropout(Component):
     """Something is left out of some steps, by a random generator of its own."""
 
+    #: Added to the fit's seed, another number in each class: they leave out independently.
+    stream = 0
+
     def before(self, fit: Fit) -> None:
         """Seed the generator."""
-        self._generator = torch.Generator().manual_seed(fit.seed)
+        self._generator = torch.Generator().manual_seed(fit.seed + self.stream)
 
     def state_dict(self) -> dict[str, Any]:
         """See `Component`."""
@@ -35,6 +38,8 @@ class Dropout(Component):
 
 class GeometryDropout(Dropout):
     """Head (i) sees the texture branch alone in some frames, an option of the authors' code."""
+
+    stream = 1 << 32
 
     def draws(self, fit: Fit, batch: StepBatch) -> DrawOptions:
         """Which frames of a batch are drawn so, (B,) bool."""

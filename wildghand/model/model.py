@@ -120,7 +120,7 @@ class WildGHandModel(nn.Module):
         )
         for side, rig in self.rigs.items() if dpd and rank else ():
             self.register_buffer(f"bones_{side}", bone_features(rig), persistent=False)
-        # Without the additions of DPD nothing would hold them, and the hand's own colour would drift.
+        # Without the additions of DPD nothing would hold them: the hand's colour would drift.
         self.log_gains = nn.Parameter(torch.zeros(frame_count, 3), requires_grad=gains)
         self.pose_steps = nn.Parameter(torch.zeros(len(rigs), frame_count, 16, 3))
         self.transl_steps = nn.Parameter(torch.zeros(len(rigs), frame_count, 3))

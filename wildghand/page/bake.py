@@ -399,12 +399,6 @@ class PoseBasis:
     #: (2, K) least and largest coefficient of any sample; others are cut to these.
     bounds: np.ndarray
 
-    def at(self, pose: np.ndarray) -> np.ndarray:
-        """(N, C) in a pose, (16, 3) rad."""
-        found = pose_features(pose[None]) @ self.regression
-        coefficients = np.clip(found[0], *self.bounds)[:, None] * self.steps
-        return self.mean + np.einsum("kc,knc->nc", coefficients, self.basis)
-
     def content(self) -> dict[str, Any]:
         """As the page reads it."""
         return {

@@ -265,9 +265,11 @@ def run_fit(
             report.progress(step, steps)
             fit.after_step()
             report(step, fit.checkpoint(step))
+            # Before the state is saved, which holds the losses of the window.
+            still = watchers.stands_still(loss)
             if after_step is not None:
                 after_step(step, watchers, loss)
-            if watchers.stands_still(loss):
+            if still:
                 fit.tell(f"The loss has stood still for {fit.plateau_steps} steps; finished early.")
                 break
         if diverged or not watchers.sound(fit):

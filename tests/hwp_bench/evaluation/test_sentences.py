@@ -66,3 +66,22 @@ def test_fits_that_end_within_half_of_their_seconds_are_named(tmp_path: Path) ->
     assert warnings(64.0, None) == warnings(64.0, 100_000)
     # It took all its steps, has enough seconds, or no limit of them.
     assert warnings(64.0, 50) == warnings(6.0, None) == warnings(None, None) == []
+
+
+def test_timed_fits_that_shared_a_core_are_named(tmp_path: Path) -> None:
+    results = results_example()
+    alone = {"fit_seconds": 64.0, "cpu_seconds": 62.0, "device": "cpu", "steps": 900}
+    first, *others = (replace(one, **alone) for one in results.captures)
+
+    def warnings(seconds: float | None, **changes: object) -> list[str]:
+        captures, budget = [replace(first, **changes), *others], {"seconds": seconds, "steps": None}
+        lines = outcome_lines(tmp_path, replace(results, captures=captures, budget=budget))
+        return [line for line in lines if line.startswith("warning")]
+
+    count = len(results.captures)
+    named = f"1 of {count} fits had less than 90 % of a core: {first.id} (50 %)"
+    told = f"warning: {named}; run timed fits on an idle machine"
+    assert warnings(64.0, cpu_seconds=32.0) == [told]
+    # Alone, on a GPU, with a clock that nobody read, or with steps for a limit.
+    assert warnings(64.0) == warnings(64.0, cpu_seconds=5.0, device="cuda") == []
+    assert warnings(64.0, cpu_seconds=None) == warnings(None, cpu_seconds=32.0) == []

@@ -22,7 +22,7 @@ from hwp_bench.leaderboard.entries import (
     write_check,
     write_entry,
 )
-from hwp_bench.leaderboard.rules import check_bound, sound_entries
+from hwp_bench.leaderboard.rules import check_bound, sound_entries, without_false_checks
 from hwp_bench.leaderboard.site import method_pages, write_method_pages
 from hwp_bench.leaderboard.submit import contest
 from hwp_bench.results import Results, write_results
@@ -117,6 +117,20 @@ def test_either_can_be_withdrawn(folder: Path, tmp_path: Path) -> None:
     assert mine.first == run(23.0, 3)
     assert mine.why_older(mine.older[0]) == "withdrawn by B: so"
     assert main(["leaderboard", "check", "--entries", str(folder)]) == 0
+
+
+def test_the_withdrawal_of_a_false_contest_is_left_out_with_it(
+    folder: Path, tmp_path: Path
+) -> None:
+    assert call(folder, tmp_path / "at20") == 0
+    assert call(folder, digest(run(20.0))[:8], "--withdraw", "rerun") == 0
+    entry = own(folder)
+    (made,) = (one for one in entry.contests if one.results is not None)
+    (answer,) = (one for one in entry.contests if one.results is None)
+    false = replace(made, date="2099" + made.date[4:])
+    kept = without_false_checks(replace(entry, contests=(false, answer)))
+    assert kept.contests == ()
+    check_bound(kept)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
@@ -49,3 +50,25 @@ def test_every_group_falls_from_its_own_rate(make_training: Callable[..., Traini
     found = {group["start"]: group["lr"] for group in descent.optimizer.param_groups}
     assert len(found) > 4
     assert list(found.values()) == pytest.approx([rate * factor for rate in found], rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("changes", "fitted"),
+    [
+        ({}, True),
+        ({"dpd": {"enabled": False}}, False),
+        ({"dpd": {"additions": False}}, False),
+        ({"mode": "bare"}, False),
+        ({"mode": "paper"}, False),
+        ({"mode": "released"}, False),
+    ],
+)
+def test_gains_of_frames_are_fitted_where_something_holds_them(
+    changes: dict[str, Any], fitted: bool, make_training: Callable[..., TrainingCapture]
+) -> None:
+    """A gain that nothing holds trades places with the colour of the hand."""
+    settings = read_settings({**UNJUDGED, **changes})
+    fit = make_fit(make_training(), settings, 0, torch.device("cpu"))
+    groups = fit.descent.optimizer.param_groups
+    found = any(one is fit.model.log_gains for group in groups for one in group["params"])
+    assert found == fit.model.log_gains.requires_grad == fitted
