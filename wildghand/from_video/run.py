@@ -31,7 +31,7 @@ from hwp_bench.base.errors import BadCapture, BadInput
 from hwp_bench.base.files import read_json, write_json
 from hwp_bench.base.records import Seconds, merged, parse_record
 from hwp_bench.capture.schema import METADATA, check_id
-from hwp_bench.importers.shared.output import CHOICES, check_choices
+from hwp_bench.importers.shared.output import check_choices
 from hwp_bench.importers.video import SolveSettings, VideoImport
 from hwp_bench.importers.video.glimpse import Glimpse
 from wildghand.avatar.files import DESCRIPTION
@@ -57,7 +57,7 @@ class VideoFit:
         UsageError: a choice makes no sense; it names the option.
     """
 
-    #: Which hands: one of `CHOICES`, as the person sees it.
+    #: Which hands, as `VideoImport.side`.
     side: str = "auto"
     #: The hand model, as `load_template` takes it.
     hand_model: str = "anny"
@@ -84,9 +84,8 @@ class VideoFit:
     settings: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        VideoImport(side=self.side, size=self.size)  # refuses what an import refuses
         check_choices(
-            ("--side", self.side in CHOICES, f"must be one of {', '.join(CHOICES)}"),
-            ("--size", 32 <= self.size <= 2048, "must be 32 to 2048 px"),
             ("--steps", self.steps is None or self.steps >= 1, "must be 1 or more"),
             ("--budget", self.seconds is None or self.seconds > 0.0, "must be more than 0"),
             ("--seed", self.seed >= 0, "must be 0 or more"),

@@ -49,6 +49,20 @@ def test_entries_that_differ_in_the_seed_alone_are_one_row_of_means() -> None:
     assert table.notes[0].startswith("Mine wins with PSNR ")
 
 
+def test_a_row_has_the_metrics_of_all_its_seeds() -> None:
+    """A machine without a package or weights has fewer; the order of the seeds does not matter."""
+    first, second = results("mine", 24.0, 0), results("mine", 24.0, 1)
+    for seed in (first, second):
+        more = [
+            replace(c, frames=[replace(f, scores={**f.scores, "flip": 0.1}) for f in c.frames])
+            for c in seed.captures
+        ]
+        other = second if seed is first else first
+        (row,) = board_rows(map(make_entry, (replace(seed, captures=more), other)))
+        assert "flip" not in row.scores
+        assert row.scores["psnr"] == pytest.approx(24.5)
+
+
 def test_another_budget_is_another_row() -> None:
     first = results("mine", 24.0, 0)
     longer = replace(results("mine", 24.0, 1), budget={"seconds": 99.0})
