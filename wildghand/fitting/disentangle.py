@@ -20,7 +20,8 @@ from wildghand.model.frames import RenderedFrames
 class Dropout(Component):
     """Something is left out of some steps, by a random generator of its own."""
 
-    #: Added to the fit's seed, another number in each class: they leave out independently.
+    #: Added to the fit's seed, another number in each class: they leave out independently. Of a sum
+    #: torch takes the low 32 bits.
     stream = 0
 
     def before(self, fit: Fit) -> None:
@@ -39,7 +40,7 @@ class Dropout(Component):
 class GeometryDropout(Dropout):
     """Head (i) sees the texture branch alone in some frames, an option of the authors' code."""
 
-    stream = 1 << 32
+    stream = 1_000_003
 
     def draws(self, fit: Fit, batch: StepBatch) -> DrawOptions:
         """Which frames of a batch are drawn so, (B,) bool."""
