@@ -27,7 +27,7 @@ from hwp_bench.evaluation.scoring import (
     read_targets,
     score_frames_of,
 )
-from hwp_bench.methods.contents import digest_of, exposed_digest, method_files
+from hwp_bench.methods.contents import digest_of, exposed_digest
 from hwp_bench.methods.contract import FRAME_CHOICES, RunSettings
 from hwp_bench.methods.manifest import MethodManifest, read_manifest, ships
 from hwp_bench.methods.request import write_request
@@ -289,7 +289,7 @@ def _refuse_edited(evaluation: CaptureEvaluation) -> None:
     planned = evaluation.method_files
     if planned is None:
         return
-    found = method_files(evaluation.manifest.root)
+    found = evaluation.manifest.contents
     changed = sorted(name for name in {*planned, *found} if planned.get(name) != found.get(name))
     if changed:
         raise BadMethod(
@@ -403,7 +403,7 @@ def evaluate_elsewhere(
         open_capture(inputs["capture"]),
         *same,
         networks={name: known[name] for name in networks},
-        method_files=method_files(manifest.root),
+        method_files=manifest.contents,
     )
     if evaluation.key != key:
         raise HwpError(

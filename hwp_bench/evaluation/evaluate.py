@@ -30,7 +30,7 @@ from hwp_bench.evaluation.results_folder import (
     open_results_folder,
     refuse_other,
 )
-from hwp_bench.methods.contents import digest_of, method_files, refuse_links_out
+from hwp_bench.methods.contents import digest_of, refuse_links_out
 from hwp_bench.methods.contract import FRAME_CHOICES, Budget
 from hwp_bench.methods.manifest import (
     DEFAULT_PRESET,
@@ -274,7 +274,7 @@ def make_plan(
     chosen = merged(manifest.presets.get(preset, {}), settings.run.settings)
     settings = replace(settings, preset=preset, run=replace(settings.run, settings=chosen))
     refuse_links_out(manifest.root, settings.confinement.exposed)
-    files = method_files(manifest.root)
+    files = manifest.contents
     networks = load_available() if networks is None else networks
     evaluations = tuple(
         CaptureEvaluation(manifest, capture, split, settings, networks, files)

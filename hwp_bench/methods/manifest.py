@@ -260,9 +260,20 @@ class MethodManifest(ManifestFields):
         return name
 
     @property
+    def contents(self) -> dict[str, str]:
+        """SHA-256 (hex) by name of every file of the method: what is run.
+
+        Baselines that ship are built on `wildghand`, whose files count as theirs.
+        """
+        own, base = method_files(self.root), PACKAGES / "wildghand"
+        if not ships(self.root) or self.root.resolve() == base:
+            return own
+        return own | {f"../wildghand/{name}": one for name, one in method_files(base).items()}
+
+    @property
     def digest(self) -> str:
-        """SHA-256 (hex) of every file of the method: what was run."""
-        return digest_of(method_files(self.root))
+        """SHA-256 (hex) of `contents`."""
+        return digest_of(self.contents)
 
 
 def find_method(text: str) -> Path:

@@ -213,6 +213,22 @@ def test_methods_of_installed_packages_are_found_without_an_import(
     assert "no luck" in str(results.captures[0].failure)
 
 
+def test_the_base_of_a_shipped_method_counts_as_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Oracle: a file of `wildghand` that is changed, in a package folder that is a copy.
+    base, own = tmp_path / "wildghand", tmp_path / "own"
+    base.mkdir()
+    own.mkdir()
+    (base / "fit.py").write_text("RATE = 1")
+    monkeypatch.setattr(hwp_bench.methods.manifest, "PACKAGES", tmp_path)
+    shipped, others = read_manifest(find_method("plain")), read_manifest(_write(own, GOOD))
+    before = shipped.digest, others.digest
+    (base / "fit.py").write_text("RATE = 2")
+    assert shipped.digest != before[0]
+    assert others.digest == before[1]
+
+
 @pytest.mark.parametrize("name", ["../plain", "baselines/../wildghand", ".", ""])
 def test_a_name_leads_to_no_other_folder(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
