@@ -82,7 +82,7 @@ class WildGHandLoop:
     ) -> None:
         chosen = read_settings({"device": "cpu", **settings})
         self._fit = make_fit(training, chosen, 0, ready_fit("cpu"))
-        self._watchers = Watchers(0)
+        self._watchers = Watchers()
         self._threads = threads or StepThreads()
         self._taken = 0
         # Steps may share work, which one of them does: a block has each of them equally often.

@@ -201,11 +201,6 @@ class Fit(IterativeFit[WildGHandAvatar]):
             component.begin(self)
 
     @property
-    def plateau_steps(self) -> int:
-        """See `IterativeFit`."""
-        return self.settings.schedule.plateau_steps
-
-    @property
     def shared_steps(self) -> int:
         """See `IterativeFit`."""
         return self.settings.schedule.texture_every

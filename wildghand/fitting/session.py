@@ -206,7 +206,7 @@ def run_resumed(
     look: Callable[[int, Loss], None] = lambda step, loss: None,
 ) -> Result:
     """Run a fit from its saved state, if there is one, and save it every 20 seconds."""
-    watchers, start, before = Watchers(fit.plateau_steps), 0, 0.0
+    watchers, start, before = Watchers(), 0, 0.0
     if state.is_file():
         start, before = load_state(state, fit, watchers, digest)
         if is_main:

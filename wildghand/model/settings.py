@@ -80,8 +80,6 @@ class ScheduleSettings:
     #: Most training frames for each second of a budget in seconds, evenly spread; 0: all. Every
     #: frame is judged before the first step, at a cost.
     frames_per_second: float = number(4.0, 0.0, 1e6)
-    #: Stop when the loss has not fallen by 0.1 % over this many steps; 0 never stops early.
-    plateau_steps: int = number(0, 0, 10_000_000)
     #: Adam's steps and constants: `fast`, ours; the `paper`'s, halved every five epochs; or the
     #: authors' code's (`released`), the same, where gradients that are not finite count as 0.
     rates: str = choice("fast", "paper", "released")

@@ -22,8 +22,6 @@ from wildghand.gaussians.fit_loop import Loss, StepThreads, repeatable, spent
 WINDOW = 50
 #: A mean loss of a window beyond this multiple of the best one means divergence.
 MAX_RISE = 3.0
-#: Fall of the mean loss from window to window, as a share, that still counts as progress.
-PROGRESS = 1e-3
 
 Result = TypeVar("Result")
 
@@ -36,11 +34,6 @@ class IterativeFit(Generic[Result]):
     """
 
     device: torch.device
-
-    @property
-    def plateau_steps(self) -> int:
-        """Steps without progress after which the fit stops early; 0: it never does."""
-        return 0
 
     @property
     def shared_steps(self) -> int:
@@ -57,6 +50,8 @@ class IterativeFit(Generic[Result]):
 
     def step(self, batch: Any, fraction: float) -> Loss:
         """Take one step; returns its loss, and changes nothing where that is not finite.
+
+        Losses are not negative: divergence is told by how many times a loss has grown.
 
         Args:
             batch: of `batches`.
@@ -125,26 +120,21 @@ class IterativeFit(Generic[Result]):
 
 
 class Watchers:
-    """Watches the loss of a fit: whether it diverges, and whether it stands still.
+    """Watches the loss of a fit: whether it diverges.
 
     A loss that is on a device is looked at when its window ends. The steps until then are not kept
     if it turns out not to be finite.
-
-    Args:
-        plateau_steps: window of the plateau; 0: never looked for.
 
     Attributes:
         step: steps behind the state that is kept; 0 while there is none.
     """
 
-    def __init__(self, plateau_steps: int = 0) -> None:
+    def __init__(self) -> None:
         self.step = 0
-        self._plateau_steps = plateau_steps
         self._best: Any = None
-        self._best_loss = self._before = math.inf
+        self._best_loss = math.inf
         self._skipped = 0
         self._losses: list[Loss] = []
-        self._plateau_losses: list[Loss] = []
 
     def watch(self, step: int, loss: Loss, model: Any) -> bool:
         """Take note of the loss after `step` steps; False means divergence.
@@ -154,23 +144,17 @@ class Watchers:
         """
         if not isinstance(loss, torch.Tensor) and not math.isfinite(loss):
             return False
-        mean = _mean_of_window(self._losses, loss, WINDOW)
-        if mean is None:
+        self._losses.append(loss)
+        if len(self._losses) < WINDOW:
             return True
+        mean = sum(_read_losses(self._losses)) / WINDOW
+        self._losses.clear()
         before, self._skipped = self._skipped, model.skipped()
         if not math.isfinite(mean) or self._skipped - before == WINDOW or not model.finite():
             return False
         if mean < self._best_loss:
             self._best_loss, self._best, self.step = mean, model.snapshot(), step
         return mean <= MAX_RISE * self._best_loss
-
-    def stands_still(self, loss: Loss) -> bool:
-        """Take note of a loss; True where a window is hardly lower than that before it."""
-        mean = _mean_of_window(self._plateau_losses, loss, self._plateau_steps)
-        if mean is None:
-            return False
-        before, self._before = self._before, mean
-        return mean > (1.0 - PROGRESS) * before
 
     def sound(self, model: Any) -> bool:
         """Whether a fit ends well: all is finite since the last window, and a step moved it."""
@@ -193,31 +177,16 @@ class Watchers:
             "step": self.step,
             "best": self._best,
             "best_loss": self._best_loss,
-            "before": self._before,
             "skipped": self._skipped,
             "losses": _read_losses(self._losses),
-            "plateau_losses": _read_losses(self._plateau_losses),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a saved state."""
         self.step, self._best = int(state["step"]), state["best"]
-        self._best_loss, self._before = float(state["best_loss"]), float(state["before"])
+        self._best_loss = float(state["best_loss"])
         self._skipped = int(state["skipped"])
         self._losses = [float(loss) for loss in state["losses"]]
-        self._plateau_losses = [float(loss) for loss in state["plateau_losses"]]
-
-
-def _mean_of_window(losses: list[Loss], loss: Loss, window: int) -> float | None:
-    """Add a loss to those of a window; their mean where that is full; it is emptied then."""
-    if not window:
-        return None
-    losses.append(loss)
-    if len(losses) < window:
-        return None
-    numbers = _read_losses(losses)
-    losses.clear()
-    return sum(numbers) / window
 
 
 def _read_losses(losses: list[Loss]) -> list[float]:
@@ -237,7 +206,7 @@ def run_fit(
     after_step: Callable[[int, Watchers, Loss], None] | None = None,
     threads: StepThreads | None = None,
 ) -> Result:
-    """Take steps until the budget is spent, the loss stands still, or the fit diverges.
+    """Take steps until the budget is spent or the fit diverges.
 
     Args:
         threads: chooses how many threads steps run on; None: by what they gain.
@@ -245,7 +214,7 @@ def run_fit(
     steps, batches = fit.count_steps(budget), fit.batches()
     for _ in range(start):
         next(batches)
-    watchers = watchers or Watchers(fit.plateau_steps)
+    watchers = watchers or Watchers()
     threads = threads or StepThreads.of(fit.device, fit.shared_steps)
     step, diverged = start, False
     report(step, fit.checkpoint(step))
@@ -265,13 +234,8 @@ def run_fit(
             report.progress(step, steps)
             fit.after_step()
             report(step, fit.checkpoint(step))
-            # Before the state is saved, which holds the losses of the window.
-            still = watchers.stands_still(loss)
             if after_step is not None:
                 after_step(step, watchers, loss)
-            if still:
-                fit.tell(f"The loss has stood still for {fit.plateau_steps} steps; finished early.")
-                break
         if diverged or not watchers.sound(fit):
             step = _go_back(fit, watchers, step)
         elif skipped := fit.skipped():

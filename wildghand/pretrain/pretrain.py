@@ -173,11 +173,6 @@ class JointFit(IterativeFit[tuple[dict[str, Tensor], int]]):
             self.fits.append(fit)
         _join_optimizers(self.fits)
 
-    @property
-    def plateau_steps(self) -> int:
-        """See `IterativeFit`."""
-        return self.settings.schedule.plateau_steps
-
     def count_steps(self, budget: Budget) -> int:
         """Steps over all captures."""
         each = self.settings.schedule.steps

@@ -31,7 +31,7 @@ from wildghand.fitting.objective import Regularisers
 from wildghand.fitting.weights import MaskWeights, Pao
 from wildghand.gaussians.fit_loop import batches, choose_device, ready_device
 from wildghand.model.settings import read_settings
-from wildghand.plain.loop import WINDOW, Watchers
+from wildghand.plain.loop import Watchers
 
 FAKE = torch.device("meta")
 HAS_GPU = choose_device("auto").type == "cuda"
@@ -198,12 +198,11 @@ def test_a_step_reads_nothing_from_the_device(
     fit = fake_fit(make_training("both" if "two hands" in name else "right"), VARIANTS[name])
     order = batches(len(fit.data.frames), fit.batch, 0)
     fit.step(next(order), 0.0)  # tables of targets are made in the first step
-    watchers = Watchers(10 * WINDOW)
+    watchers = Watchers()
     with Waits() as waits, HandedOver() as handed:
         for step in range(3):
             loss = fit.step(next(order), 0.5)
             assert watchers.watch(step, loss, fit.model)
-            assert not watchers.stands_still(loss)
             fit.avatar(step)
     assert waits.found == []
     assert handed.found == []
