@@ -59,8 +59,6 @@ _.channelnames  # OpenImageIO reads it
 _.camera_position  # pyvista reads it
 _.view_angle  # pyvista reads it
 _.gain_deviation  # the table CUES names it; getattr reads it
-_.residual_deviation  # a measured cue of the pre-pass, for tests and benchmarks
-_.sharpness  # a measured cue of the pre-pass, for tests and benchmarks
 _.blur_deviation  # the table CUES names it; getattr reads it
 _.misplacement_deviation  # the table CUES names it; getattr reads it
 _.hidden_deviation  # the table CUES names it; getattr reads it

@@ -81,10 +81,6 @@ class FrameAssessment:
     gain_deviation: np.ndarray
     #: (R,) median log residual of the hand under the intensity model, in [0, inf).
     residual: np.ndarray
-    #: (R,) deviation of the log of `residual`.
-    residual_deviation: np.ndarray
-    #: (R,) sharpness: share of the expected texture that shows; about 1 or more when sharp.
-    sharpness: np.ndarray
     #: (R,) deviation of border width and texture towards blur, the larger of the two.
     blur_deviation: np.ndarray
     #: (R,) estimated extent of the blur in its strongest direction, px.
@@ -151,7 +147,6 @@ def neutral_assessment(
             "clean": good,
             "omega_dropout": good,
             "frame_weights": np.ones(len(indices)),
-            "sharpness": np.ones(len(indices)),
             "refine_pose": np.zeros(len(indices), dtype=bool),
             "log_gains": np.zeros((len(indices), 3)),
             "pixel_weights": np.full((len(indices), *size), 255, dtype=np.uint8),

@@ -97,8 +97,8 @@ def classify_frames(
     usable = np.zeros(count, dtype=bool)
     usable[rows] = True
 
-    def spread(values: np.ndarray, missing: float = 0.0) -> np.ndarray:
-        result = np.full((count, *values.shape[1:]), missing)
+    def spread(values: np.ndarray) -> np.ndarray:
+        result = np.zeros((count, *values.shape[1:]))
         result[rows] = values
         return result
 
@@ -111,7 +111,7 @@ def classify_frames(
         least = max(tolerance, float(np.quantile(against, CLEAN_SHARE)))
         best = spread(clean_probability(against, least))
     certain = clean if (clean >= CLEAN_FROM).sum() >= LEAST_CLEAN else best
-    border, texture = _gathered(found, "border"), _gathered(found, "texture")
+    border = _gathered(found, "border")
     sharp_border = float(np.exp(normal_value(np.log(border), CLEAN_SHARE)[0]))
     extent = np.sqrt(np.maximum(np.nan_to_num(border) ** 2 - sharp_border**2, 0.0))
     refine = (off["misplacement"] > _CLEAR) & (off["border"] < _CLEAR)
@@ -126,8 +126,6 @@ def classify_frames(
         log_gains=spread(gains),
         gain_deviation=spread(off["gain"]),
         residual=spread(_gathered(found, "level")),
-        residual_deviation=spread(off["level"]),
-        sharpness=spread(np.nan_to_num(texture, nan=1.0), missing=1.0),
         blur_deviation=spread(np.maximum(off["border"], off["texture"])),
         blur_extent=spread(extent),
         misplacement=spread(_gathered(found, "misplacement")),
