@@ -68,8 +68,6 @@ class ScanSettings(LoopSettings):
     displacement_smoothness: float = number(1e-3, 0.0, 1e4)
     #: Weight of the shadows' distance to 1 (UHM: 0.1, of an L1 of weight 1).
     shadow_one: float = number(1e-3, 0.0, 1e4)
-    #: Weight of the shadows' total variation over the texture plane.
-    shadow_smoothness: float = number(0.0, 0.0, 1e4)
     #: Weight of the total variation of texels that no training frame shows.
     unseen_smoothness: float = number(0.1, 0.0, 1e4)
 
@@ -375,7 +373,6 @@ class ScanRecipe(Recipe[ScanSettings]):
         loss = loss + settings.mask_weight * self.outline(batch, drawing, weights)
         for plane in drawing.shadows:
             loss = loss - settings.shadow_one * plane.clamp(min=1e-4).log().mean()
-            loss = loss + settings.shadow_smoothness * total_variation(plane[:, 0])
         for side, laplacian in self._laplacians.items():
             hand = self.model.hand(side)
             rough = laplacian.roughness(hand.raised() / laplacian.spacing)
