@@ -39,11 +39,10 @@ _SHORT = {
 
 
 def sets() -> dict[str, list[Scene]]:
-    """Every set of scenes by its name: the paper's captures, the groups, those of priors."""
+    """Every set of scenes by its name: the paper's captures, the groups, those of the prior."""
     found = {"captures": [load_scene(name) for name in scene_names()]}
     found |= {group: [load_scene(name) for name in scene_names(group)] for group in scene_groups()}
-    for name, folder in (("prior", PRIOR), ("wider prior", PRIOR / "wide")):
-        found[name] = [load_scene(str(path)) for path in sorted(folder.glob("*.toml"))]
+    found["prior"] = [load_scene(str(path)) for path in sorted(PRIOR.glob("*.toml"))]
     return found
 
 

@@ -29,9 +29,8 @@ def sets() -> dict[str, tuple[Scene, ...]]:
     found = {"captures": tuple(map(load_scene, scene_names()))}
     for group in scene_groups():
         found[group] = tuple(map(load_scene, scene_names(group)))
-    for name, folder in (("prior", "scenes"), ("wider prior", "scenes/wide")):
-        files = sorted((PRIORS / folder).glob("*.toml"))
-        found[name] = tuple(load_scene(str(path)) for path in files)
+    files = sorted((PRIORS / "scenes").glob("*.toml"))
+    found["prior"] = tuple(load_scene(str(path)) for path in files)
     assert all(found.values())
     return found
 
@@ -84,16 +83,6 @@ def test_a_wild_suite_is_wide(group: str) -> None:
     assert shown <= FURTHER
     assert not any(scene.sensor.h264 for scene in scenes)
     assert min(counts(scenes).values()) > 0
-
-
-def test_the_wider_prior_sees_clean_hands_of_eight_people() -> None:
-    scenes = sets()["wider prior"]
-    assert len({scene.subject.seed for scene in scenes}) == 8
-    assert not any(scene.effects or scene.estimator for scene in scenes)
-    assert {scene.hands for scene in scenes} == {"both"}
-    tones = [scene.subject.tone for scene in scenes]
-    assert min(tones) < -0.2
-    assert max(tones) > 1.2
 
 
 def test_an_overlap_is_found_in_every_part() -> None:
