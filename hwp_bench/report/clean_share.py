@@ -51,10 +51,10 @@ class ShareScore:
     share: float
     #: Mean over captures of means over seeds and test frames.
     score: Estimate
-    #: The same of its difference from the first method; None for that one, and where the two have
-    #: no capture or no seed in common.
+    #: The same of its difference from the first method, over the captures of which both have the
+    #: same seeds; None for the first, and where there is no such capture.
     behind: Estimate | None
-    #: Seeds of which the score is.
+    #: Seeds of which the score is; the fewest of a capture.
     seeds: int
 
 
@@ -90,7 +90,7 @@ def scores_by_share(
     shares = {digest: clean_share_of(info) for digest, info in captures.items()}
     firsts: dict[str, Results] = {}
     curves: dict[str, dict[float, dict[str, np.ndarray]]] = {}
-    seeds: dict[tuple[str, float], tuple[int, ...]] = {}
+    seeds: dict[tuple[str, str], list[int]] = {}
     for run in group_runs([_of_its_captures(result) for result in results]):
         key = same_but_seed(replace(run.first, suite=""))
         firsts.setdefault(key, run.first)
@@ -99,7 +99,7 @@ def scores_by_share(
             if share is None:
                 continue
             own = sorted(run.seeds)
-            seeds[key, share] = tuple(own)
+            seeds[key, capture.digest] = own
             values = run.values(capture.id, metric, own)
             curves.setdefault(key, {}).setdefault(share, {})[capture.digest] = values
     if not curves:
@@ -110,13 +110,22 @@ def scores_by_share(
         )
     titles = dict(zip(firsts, labels([*firsts.values()]), strict=True))
     first = next(iter(curves))
+
+    def behind(key: str, share: float) -> Estimate | None:
+        """The paired difference from the first over the captures of which both have these seeds."""
+        reference = {} if key == first else curves[first].get(share, {})
+        both = [one for one in curves[key][share] if one in reference]
+        same = [one for one in both if seeds[key, one] == seeds[first, one]]
+        pairs = [curves[key][share][one] - reference[one] for one in same]
+        return bootstrap_mean(pairs, resamples=_RESAMPLES) if pairs else None
+
     found = [
         ShareScore(
             titles[key],
             share,
             bootstrap_mean([*values.values()], resamples=_RESAMPLES),
-            None if key == first else _behind(values, curves[first].get(share, {})),
-            len(seeds[key, share]),
+            behind(key, share),
+            min(len(seeds[key, digest]) for digest in values),
         )
         for key, curve in curves.items()
         for share, values in curve.items()
@@ -128,16 +137,6 @@ def _of_its_captures(result: Results) -> Results:
     """A result whose captures are named by their digests, because their names are not unique."""
     digests = sorted(capture.digest for capture in result.captures)
     return replace(result, suite=" ".join(digests))
-
-
-def _behind(
-    values: Mapping[str, np.ndarray], reference: Mapping[str, np.ndarray]
-) -> Estimate | None:
-    """The paired difference over the captures of both, if they have as many seeds."""
-    pairs = [(own, reference[key]) for key, own in values.items() if key in reference]
-    if not pairs or any(own.shape != other.shape for own, other in pairs):
-        return None
-    return bootstrap_mean([own - other for own, other in pairs], resamples=_RESAMPLES)
 
 
 def clean_share_table(

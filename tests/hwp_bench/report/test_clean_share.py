@@ -58,6 +58,15 @@ def test_a_method_is_one_curve_over_its_suites(study) -> None:
     assert shown == [(10, 1, 1), (10, 1, 1), (60, 1, 1), (60, 1, 1)]
 
 
+def test_only_scores_of_the_same_seeds_are_paired(study) -> None:
+    results, captures = study
+    # Method `mine` has as many seeds as the first at 10 %, but another one.
+    results[1] = replace(results[1], seed=1)
+    found = scores_by_share(results, captures, "psnr")
+    differences = [one.behind and one.behind.value for one in found]
+    assert differences == [None, None, None, pytest.approx(1.0)]
+
+
 def test_captures_of_no_suite_are_told_apart_by_their_digests(study) -> None:
     results, captures = study
     named = scores_by_share(results, captures, "psnr")
