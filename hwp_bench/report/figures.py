@@ -163,7 +163,7 @@ def draw_pareto(
 ) -> Figure:
     """Draw mean validation score over the seconds of fitting, the front behind the curves.
 
-    Where there are many methods, only those of the front have their bands.
+    Where there are many methods, only the ends of the front have their bands.
     """
     facts = metric_facts(metric)
     places = order or {curve.label: index for index, curve in enumerate(curves)}
@@ -181,10 +181,10 @@ def draw_pareto(
         _seconds_axis(axes, start, stop)
         scale_up(axes, *up)
         _draw_front(axes, {curve.label: curve for curve in curves}, front, facts.higher_is_better)
-        leading = {part.label for part in front}
+        ends = {part.label for part in (*front[:1], *front[-1:])}
         for curve in curves:
             style = series_style(places[curve.label])
-            banded = len(curves) <= _BANDS or curve.label in leading
+            banded = len(curves) <= _BANDS or curve.label in ends
             if banded and curve.low is not None and curve.high is not None:
                 bottom, top = np.clip(curve.low, low, high), np.clip(curve.high, low, high)
                 axes.fill_between(
@@ -211,7 +211,7 @@ def bands_text(curves: Sequence[MeanCurve]) -> str:
     """Say what the bands of `draw_pareto` are, or why there are none."""
     if all(curve.low is None for curve in curves):
         return f"no intervals: of fewer than {LEAST_CAPTURES} captures they say nothing"
-    some = " of the methods on the front" if len(curves) > _BANDS else ""
+    some = " of the first and the last method on the front" if len(curves) > _BANDS else ""
     return f"shaded bands are 95 % intervals over captures{some}"
 
 

@@ -15,6 +15,7 @@ from hwp_bench.analysis.cost import analyse_cost
 from hwp_bench.analysis.pairing import group_runs
 from hwp_bench.report.figures import (
     PALETTE,
+    bands_text,
     draw_bars,
     draw_leads,
     draw_pareto,
@@ -86,6 +87,24 @@ def test_two_captures_have_lines_and_no_bands() -> None:
     figure = draw_pareto(found.curves, found.front, "psnr")
     assert figure.legends[0].get_title().get_text().startswith("No intervals: of fewer than 3")
     assert of_class(drawn(inline_svg(figure, "t")), "band") == []
+
+
+def test_of_many_methods_only_the_ends_of_the_front_have_bands() -> None:
+    # Each method begins after the one before has, and above it: all are on the front.
+    made = [
+        made_results(
+            f"m{n}",
+            lambda c, f, s: 20.0,
+            curve=[(2.0**k, 15.0 + 2 * n) for k in range(n, 6)],
+            seconds=32.0,
+        )
+        for n in range(5)
+    ]
+    found = analyse_cost(group_runs(made), "psnr")
+    assert len({part.label for part in found.front}) == 5
+    figure = draw_pareto(found.curves, found.front, "psnr", {f"M{n}": n for n in range(5)})
+    assert len(of_class(drawn(inline_svg(figure, "t")), "band")) == 2
+    assert bands_text(found.curves).endswith("of the first and the last method on the front")
 
 
 def test_names_of_two_figures_on_a_page_differ_and_every_reference_is_there() -> None:
