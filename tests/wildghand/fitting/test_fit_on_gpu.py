@@ -97,7 +97,7 @@ def test_a_stopped_fit_goes_on(make_training: TrainingMaker, tmp_path: Path) -> 
             save_state(file, stopped, watchers, step=step, seconds=1.0, digest="d")
 
     whole = run_fit(stopped, Budget(), SilentReport(), after_step=save)
-    watchers = Watchers(0)
+    watchers = Watchers()
     start, _ = load_state(file, again, watchers, "d")
     finished = run_fit(again, Budget(), SilentReport(), start=start, watchers=watchers)
     assert finished.steps == STEPS

@@ -60,7 +60,7 @@ def fitted(request: Path, changes: dict[str, Any], world: World) -> tuple[State,
 def resumed(request: Path, world: World, state: Path) -> State:
     """Two steps, a saved state, and the rest from it."""
     settings = read_settings({**SHORT, **VARIANTS["unjudged"]})
-    half, watchers = make_fit(open_request(request), settings, 0, CPU, world), Watchers(0)
+    half, watchers = make_fit(open_request(request), settings, 0, CPU, world), Watchers()
 
     def save(step: int, watched: Watchers, loss: object) -> None:
         if step == 2 and world.is_main:
@@ -68,7 +68,7 @@ def resumed(request: Path, world: World, state: Path) -> State:
 
     run_fit(half, Budget(), SilentReport(), watchers=watchers, after_step=save)
     world.wait_for_main()
-    rest, watchers = make_fit(open_request(request), settings, 0, CPU, world), Watchers(0)
+    rest, watchers = make_fit(open_request(request), settings, 0, CPU, world), Watchers()
     start, _ = load_state(state, rest, watchers, "d")
     rest.require_same(start)
     return run_fit(rest, Budget(), SilentReport(), start=start, watchers=watchers).model.snapshot()

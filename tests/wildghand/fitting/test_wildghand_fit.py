@@ -137,7 +137,7 @@ def test_a_stopped_fit_goes_on_as_if_it_had_not_been(
     half = make_fit(training, settings, 0, device)
     with pytest.raises(Stopped):
         run_fit(half, Budget(), SilentReport(), after_step=stop)
-    rest, watchers = make_fit(training, settings, 0, device), Watchers(0)
+    rest, watchers = make_fit(training, settings, 0, device), Watchers()
     assert load_state(tmp_path / "state", rest, watchers, "of this fit") == (17, 1.5)
     resumed = run_fit(rest, Budget(), SilentReport(), start=17, watchers=watchers)
     expected, found = whole.model.snapshot(), resumed.model.snapshot()

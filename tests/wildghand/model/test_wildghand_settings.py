@@ -183,7 +183,7 @@ def test_settings_are_few_and_each_number_has_a_range() -> None:
             if item.type in ("int", "float"):
                 assert "range" in item.metadata, item.name
     ours = [n for n in EVERY if n.partition(".")[0] in ("network", "schedule", "terms")]
-    assert len(ours) == 21
+    assert len(ours) == 20
     assert len(EVERY) <= 60
     assert len([name for name in EVERY if "." not in name]) <= 8
 

@@ -156,7 +156,7 @@ def test_the_same_seed_repeats_and_a_stopped_run_goes_on(
     trainings = [training_of(subjects[name], tmp_path) for name in ("anna", "ben")]
     settings = read_settings(QUICK)
     whole, half, rest = (JointFit(trainings, settings, 0, CPU) for _ in range(3))
-    budget, watchers = Budget(steps=13), Watchers(0)
+    budget, watchers = Budget(steps=13), Watchers()
     expected_weights, _ = run_fit(whole, budget, SilentReport())
 
     class Stopped(Exception):
@@ -169,7 +169,7 @@ def test_the_same_seed_repeats_and_a_stopped_run_goes_on(
 
     with pytest.raises(Stopped):
         run_fit(half, budget, SilentReport(), watchers=watchers, after_step=stop)
-    resumed = Watchers(0)
+    resumed = Watchers()
     assert load_state(tmp_path / "state", rest, resumed, "d") == (7, 1.0)
     weights, steps = run_fit(rest, budget, SilentReport(), start=7, watchers=resumed)
     assert steps == 13
