@@ -114,9 +114,11 @@ def scores_by_share(
     def behind(key: str, share: float) -> Estimate | None:
         """The paired difference from the first over the captures of which both have these seeds."""
         reference = {} if key == first else curves[first].get(share, {})
-        both = [one for one in curves[key][share] if one in reference]
-        same = [one for one in both if seeds[key, one] == seeds[first, one]]
-        pairs = [curves[key][share][one] - reference[one] for one in same]
+        pairs = [
+            values - reference[digest]
+            for digest, values in curves[key][share].items()
+            if digest in reference and seeds[key, digest] == seeds[first, digest]
+        ]
         return bootstrap_mean(pairs, resamples=_RESAMPLES) if pairs else None
 
     found = [
