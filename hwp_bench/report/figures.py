@@ -61,7 +61,7 @@ SERIES = 8
 #: Dashes of the series, in turn, so that no curve depends on its colour.
 DASHES: Sequence[Any] = ("-", (0, (7, 3)), (0, (2, 3)), (0, (9, 3, 2, 3)))
 #: Most methods whose bands are all drawn: more of them hide each other.
-_BANDS = 4
+_BANDS = 2
 #: Width of every figure, px; a page scales it.
 WIDTH = 460.0
 #: Marks an artist whose name becomes a class of the element in a page.
