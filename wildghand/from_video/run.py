@@ -39,14 +39,15 @@ from wildghand.fitting.parallel import SINGLE_PROCESS, World
 from wildghand.fitting.session import Watch
 from wildghand.model.settings import nested
 
-#: Most frames that are imported, spread over the video, by default and with `quick`: 20 s at 30
-#: frames a second, and a third of that.
-FRAMES, QUICK_FRAMES = 600, 200
+#: Most frames that are imported, spread over the video, by default and with `quick`: 20 s at 15
+#: frames a second, and a third of that. Neighbours show the same.
+FRAMES, QUICK_FRAMES = 300, 100
 #: What the avatar of a video has in place of the method's settings: no Gaussians so wide that they
-#: draw a rim outside of the hand, which a score hardly sees and a person does.
-VIDEO: Mapping[str, Any] = MappingProxyType({"max_scale": 0.003})
+#: draw a rim outside of the hand, which a score hardly sees and a person does; and half of the
+#: steps, after which kept-out frames hardly gain.
+VIDEO: Mapping[str, Any] = MappingProxyType({"max_scale": 0.003, "schedule": {"steps": 1000}})
 #: What `quick` changes of the method's settings: fewer Gaussians, fewer steps.
-QUICK: Mapping[str, Any] = MappingProxyType({"gaussians": 5000, "schedule": {"steps": 700}})
+QUICK: Mapping[str, Any] = MappingProxyType({"gaussians": 5000, "schedule": {"steps": 400}})
 
 
 @dataclass(frozen=True)
@@ -98,7 +99,7 @@ class VideoFit:
 
     def method_settings(self) -> dict[str, Any]:
         """Return the method's settings, with what a video and `quick` change."""
-        return with_quick(merged(VIDEO, nested(self.settings)), quick=self.quick)
+        return merged(VIDEO, nested(with_quick(self.settings, quick=self.quick)))
 
 
 def with_quick(settings: Mapping[str, Any], *, quick: bool) -> dict[str, Any]:
