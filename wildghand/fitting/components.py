@@ -7,7 +7,7 @@ import torch
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.fitting.choice import AveragedSteps, StateChoice, ValidationFrames
 from wildghand.fitting.colors import StartColors
-from wildghand.fitting.disentangle import Dpd, GeometryDropout
+from wildghand.fitting.disentangle import Dpd
 from wildghand.fitting.fit import Component, Fit
 from wildghand.fitting.judging import HandMasks, HiddenSkin, Prepass
 from wildghand.fitting.light import Lighting
@@ -44,7 +44,6 @@ def components_of(settings: WildGHandSettings) -> list[Component]:
         (True, Pao if by_regions else MaskWeights),
         (True, Regularisers),
         (settings.dpd.enabled, Dpd),
-        (settings.schedule.geometry_dropout > 0.0, GeometryDropout),
         (visibility.enabled, FewShown),
     ]
     return [kind() for wanted, kind in listed if wanted]

@@ -1,4 +1,4 @@
-"""What steps leave out at random: DPD's biases of frames, and the geometry branch."""
+"""DPD in a fit: biases of frames, which some steps leave out."""
 
 from __future__ import annotations
 
@@ -17,40 +17,7 @@ from wildghand.model import terms
 from wildghand.model.frames import RenderedFrames
 
 
-class Dropout(Component):
-    """Something is left out of some steps, by a random generator of its own."""
-
-    #: Added to the fit's seed, another number in each class: they leave out independently. Of a sum
-    #: torch takes the low 32 bits.
-    stream = 0
-
-    def before(self, fit: Fit) -> None:
-        """Seed the generator."""
-        self._generator = torch.Generator().manual_seed(fit.seed + self.stream)
-
-    def state_dict(self) -> dict[str, Any]:
-        """See `Component`."""
-        return {"generator": self._generator.get_state()}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """See `Component`."""
-        self._generator.set_state(state["generator"].cpu())
-
-
-class GeometryDropout(Dropout):
-    """Head (i) sees the texture branch alone in some frames, an option of the authors' code."""
-
-    stream = 1_000_003
-
-    def draws(self, fit: Fit, batch: StepBatch) -> DrawOptions:
-        """Which frames of a batch are drawn so, (B,) bool."""
-        if not batch.stepping:
-            return {}
-        chances = torch.full(batch.rows.shape, fit.settings.schedule.geometry_dropout)
-        return {"plain": upload(~draw_kept(chances, self._generator), fit.device)[batch.part]}
-
-
-class Dpd(Dropout):
+class Dpd(Component):
     """Perturbations are explained as biases, which are left out of some steps.
 
     Attributes:
@@ -62,7 +29,7 @@ class Dpd(Dropout):
 
     def before(self, fit: Fit) -> None:
         """Bring temporal weights to what the pre-pass found."""
-        super().before(fit)
+        self._generator = torch.Generator().manual_seed(fit.seed)
         settings = fit.settings.dpd
         self.temporal: TemporalTarget | None = None
         self.drop = torch.full((len(fit.data.frames),), settings.omega_dropout)
@@ -114,3 +81,11 @@ class Dpd(Dropout):
                 for side in model.perturbation
             }
         }
+
+    def state_dict(self) -> dict[str, Any]:
+        """See `Component`."""
+        return {"generator": self._generator.get_state()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """See `Component`."""
+        self._generator.set_state(state["generator"].cpu())

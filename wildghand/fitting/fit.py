@@ -74,7 +74,6 @@ class DrawOptions(TypedDict, total=False):
     move: bool
     features: Features
     dark: Mapping[str, Tensor]
-    plain: Tensor
 
 
 class Component:

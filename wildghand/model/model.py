@@ -17,7 +17,6 @@ from torch import Tensor, nn
 from hwp_bench.hands import HandTemplate, sample_surface
 from wildghand.dpd.dpd import DynamicPerturbation, FramePerturbation, Temporal, bone_features
 from wildghand.dpd.temporal import scale_refinement
-from wildghand.gaussians.attributes import RawAttributes
 from wildghand.gaussians.found import Found
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import AnchorPoses, HandRig, rig_of
@@ -181,7 +180,6 @@ class WildGHandModel(nn.Module):
         refine: bool = False,
         features: Mapping[str, HandFeatures] | None = None,
         dark: Mapping[str, Tensor] | None = None,
-        plain: Tensor | None = None,
     ) -> RenderedFrames:
         """Draw training frames with everything that is particular to them.
 
@@ -192,8 +190,6 @@ class WildGHandModel(nn.Module):
             teach: from (B,) temporal weights, before dropout and without gradient, to how much the
                 canonical hand learns from each frame, (B,) in [0, 1], or None: all. None: all.
             dark: (B, N) factors of the hands' shadows by side, where they are at hand already.
-            plain: (B,) bool, frames whose attributes are those of the texture branch alone; None:
-                no frame.
         """
         if dark is None:
             hands = {
@@ -217,11 +213,6 @@ class WildGHandModel(nn.Module):
             prediction = self.predict(
                 side, anchors, pose.detach(), None if features is None else features[side]
             )
-            if plain is not None:
-                known = self.network.features(side) if features is None else features[side]
-                alone = self.network.attributes_of_texture(side, known).concatenate()
-                mixed = torch.where(plain[:, None, None], alone, prediction.raw.concatenate())
-                prediction = replace(prediction, raw=RawAttributes.split(mixed))
             prediction = dimmed(prediction, dark.get(side))
             if refine:
                 step = prediction.refinement

@@ -83,9 +83,6 @@ class ScheduleSettings:
     #: Adam's steps and constants: `fast`, ours; the `paper`'s, halved every five epochs; or the
     #: authors' code's (`released`), the same, where gradients that are not finite count as 0.
     rates: str = choice("fast", "paper", "released")
-    #: Chance that head (i) sees the texture branch alone in a frame of a step; 0.3 where the
-    #: authors' code has this on (`pose_reg`).
-    geometry_dropout: float = number(0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True)

@@ -44,7 +44,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "default": {},
     "two hands": {},
     "paper": {"mode": "paper"},
-    "released": {"mode": "released", "schedule.geometry_dropout": 0.3},
+    "released": {"mode": "released"},
     "released, two hands": {"mode": "released"},
     "binary": {"pao.variant": "binary"},
     "bare": {"dpd.enabled": False, "pao.enabled": False, "heads": False},

@@ -20,7 +20,6 @@ from tiny_fits import TINY
 from hwp_bench.capture import HandModelId
 from hwp_bench.hands import pose_hand, project
 from hwp_bench.methods.contract import Budget, TrainingCapture
-from wildghand.fitting.disentangle import Dropout
 from wildghand.fitting.fit import Component, Fit, StepBatch
 from wildghand.fitting.method import affordable
 from wildghand.fitting.objective import Reconstruction, Regularisers, choose_perceptual
@@ -227,34 +226,6 @@ def test_a_gradient_that_is_not_finite_counts_as_zero_in_released_and_skips_a_st
     assert not moved[place]
     assert any(moved) == moves
     assert fit.finite()
-
-
-def test_steps_leave_the_geometry_branch_out_by_the_chance_that_is_set(
-    make_training: TrainingMaker,
-) -> None:
-    fit = fit_of(make_training(), "released", **{"schedule.geometry_dropout": 0.5})
-    rows = torch.arange(8)
-    drawing = fit.draw(StepBatch(rows, stepping=True), kept=None)
-    raw = drawing.hands["right"].prediction.raw.concatenate()
-    network = fit.model.network
-    alone = network.attributes_of_texture("right", network.features("right")).concatenate()
-    plain = [torch.allclose(frame, alone, atol=1e-6) for frame in raw]
-    assert 0 < sum(plain) < 8
-    # The avatar itself, and frames that are looked at, have all of it.
-    looked = fit.draw(StepBatch(rows)).hands["right"].prediction.raw.concatenate()
-    assert not any(torch.allclose(frame, alone, atol=1e-6) for frame in looked)
-
-
-def test_what_different_dropouts_leave_out_is_independent() -> None:
-    """Oracle: with a chance of 0.3 each, both leave a step out with one of 0.09."""
-    kinds = Dropout.__subclasses__()
-    assert len(kinds) == 2
-    draws = []
-    for kind in kinds:
-        dropout = kind.__new__(kind)
-        Dropout.before(dropout, SimpleNamespace(seed=3))
-        draws.append(torch.rand(20_000, generator=dropout._generator) < 0.3)
-    assert float((draws[0] & draws[1]).double().mean()) == pytest.approx(0.09, abs=0.01)
 
 
 def test_a_fit_of_the_papers_network_says_that_it_starts_from_random_weights() -> None:

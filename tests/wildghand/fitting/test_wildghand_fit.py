@@ -88,7 +88,7 @@ def test_a_fit_learns_what_the_frames_show(
         {"pao.variant": "binary"},
         {"dpd.additions": False},
         {"mode": "paper", "schedule.epochs": 0},
-        {"mode": "released", "schedule.epochs": 0, "schedule.geometry_dropout": 0.3},
+        {"mode": "released", "schedule.epochs": 0},
         {"prepass.enabled": False},
     ],
     ids=str,

@@ -84,7 +84,6 @@ def test_the_published_modes_have_no_addition(
     schedule = made.schedule
     assert (schedule.batch, schedule.rates, schedule.epochs) == (batch, mode, 50)
     assert (schedule.frames_per_second, schedule.average_share) == (0.0, 0.0)
-    assert schedule.geometry_dropout == 0.0
     assert not made.prepass.enabled
     assert not made.subject.enabled
     assert not made.light.enabled
@@ -150,7 +149,6 @@ def test_the_size_chooses_the_network() -> None:
         ({"prepass.weight_floor": 1.5}, r"prepass\.weight_floor: is 1\.5"),
         ({"pao.variant": "masks"}, r"pao\.variant: is 'masks'"),
         ({"schedule.epochs": -1}, r"schedule\.epochs: is -1"),
-        ({"schedule.geometry_dropout": "often"}, r"schedule\.geometry_dropout: is 'often'"),
         ({"schedule.rates": "slow"}, r"schedule\.rates: is 'slow'"),
         ({"terms.surface": -1}, r"terms\.surface: is -1"),
         ({"network.plane_resolution": 42}, "plane_resolution: is 42"),
