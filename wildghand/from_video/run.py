@@ -43,9 +43,16 @@ from wildghand.model.settings import nested
 #: frames a second, and a third of that. Neighbours show the same.
 FRAMES, QUICK_FRAMES = 300, 100
 #: What the avatar of a video has in place of the method's settings: no Gaussians so wide that they
-#: draw a rim outside of the hand, which a score hardly sees and a person does; and half of the
-#: steps, after which kept-out frames of a clip of so many hardly gain.
-VIDEO: Mapping[str, Any] = MappingProxyType({"max_scale": 0.003, "schedule": {"steps": 1000}})
+#: draw a rim outside of the hand, which a score hardly sees and a person does; opacities that are
+#: the same in every pose, or dark spots open in the palm in new ones; and half of the steps, after
+#: which kept-out frames of a clip of so many hardly gain.
+VIDEO: Mapping[str, Any] = MappingProxyType(
+    {
+        "max_scale": 0.003,
+        "network": {"frame_opacities": False},
+        "schedule": {"steps": 1000},
+    }
+)
 #: What `quick` changes of the method's settings: fewer Gaussians, fewer steps.
 QUICK: Mapping[str, Any] = MappingProxyType({"gaussians": 5000, "schedule": {"steps": 400}})
 

@@ -47,6 +47,9 @@ class NetworkChoice:
     plane_resolution: int = number(40, 4, 512)
     #: Leave the first 14 channels of the map at 0 and add them to the raw attributes.
     direct: bool = True
+    #: Opacities depend on pose and normals, as the other attributes do. `wildghand fit VIDEO` has
+    #: false: there they open dark spots in the palm in poses that no frame has shown.
+    frame_opacities: bool = True
 
     def __post_init__(self) -> None:
         self.build()

@@ -85,7 +85,12 @@ def mlp(inputs: int, width: int, outputs: int, layers: int) -> nn.Sequential:
 
 
 class AttributeHead(nn.Module):
-    """Head (i): raw attributes from both branches; `direct` adds the map's first channels."""
+    """Head (i): raw attributes from both branches; `direct` adds the map's first channels.
+
+    Without `frame_opacities` the opacities are the texture branch's alone.
+    """
+
+    of_frame: Tensor
 
     def __init__(self, settings: NetworkSettings, texture: int, geometry: int) -> None:
         super().__init__()
@@ -94,12 +99,19 @@ class AttributeHead(nn.Module):
         self.geometry = hidden(geometry, width, settings.head_layers)
         # One linear layer for each attribute, side by side.
         self.attributes = zeroed(nn.Linear(width, CHANNELS))
+        moved = dict.fromkeys(SIZES, 1.0) | {"logit_opacities": float(settings.frame_opacities)}
+        of_frame = torch.tensor([moved[name] for name, size in SIZES.items() for _ in range(size)])
+        self.register_buffer("of_frame", of_frame[:, None], persistent=False)
         self.direct: nn.Linear | None = None
         if settings.direct:
             self.direct = nn.Linear(settings.identity_channels, CHANNELS, bias=False)
             with torch.no_grad():
                 self.direct.weight.zero_()
                 self.direct.weight[:, :CHANNELS] = torch.diag(torch.tensor(DIRECT_GAINS))
+
+    def frame_weights(self) -> Tensor:
+        """(14, width) weights of the hidden layer on the geometry features."""
+        return self.attributes.weight * self.of_frame
 
     def forward(
         self, hidden: Tensor, x_g: Tensor | None, latent: Tensor, initial: Tensor
@@ -111,7 +123,9 @@ class AttributeHead(nn.Module):
         `latent` (N, I) the identity features (I is 0 without the direct path), `initial` (N, 14)
         the start.
         """
-        change = self.attributes(hidden if x_g is None else hidden + self.geometry(x_g))
+        change = self.attributes(hidden)
+        if x_g is not None:
+            change = change + linear(self.geometry(x_g), self.frame_weights())
         canonical = initial.to(change.dtype)
         if self.direct is not None:
             canonical = canonical + self.direct(latent)

@@ -31,6 +31,9 @@ class NetworkSettings:
     identity_spread: float = number(0.1, 0.0, 10.0)
     #: Leave the first 14 channels of the map at 0 and add them to the raw attributes.
     direct: bool = True
+    #: Opacities depend on pose and normals, as the other attributes do. Without, they are the
+    #: texture branch's: skin that bends or turns does not become transparent.
+    frame_opacities: bool = True
     #: Cells along each edge of the UV plane that the encoder-decoder works on; a multiple of 4.
     plane_resolution: int = number(40, 4, 512)
     #: Features of a cell; of `paper`'s tokens too.

@@ -94,7 +94,7 @@ def network_content(avatar: WildGHandAvatar) -> dict[str, Any] | None:
         rows(_wider(branch.mix.weight, 4 * points), quads=points),
         rows(*(layer.bias[:, None] for layer in of_hidden), quads=hidden),
         rows(*(geometry(layer.weight) for layer in of_hidden), quads=hidden),
-        rows(_wider(head.attributes.weight, 4 * hidden), quads=4),
+        rows(_wider(head.frame_weights(), 4 * hidden), quads=4),
         _wider((last.bias + dark.start)[None], 4),
         _wider(last.weight, 4 * hidden),
         geometry(dark.light.weight),

@@ -234,7 +234,8 @@ def _check_fit(
     """Refuse a prior that is sound but of another kind than the fit."""
     needed = network.to_json()
     for name, value in dataclasses.asdict(network_settings(**record.network)).items():
-        if value != needed[name]:
+        # Opacities of either kind have the same weights.
+        if value != needed[name] and name != "frame_opacities":
             raise OtherKind(
                 f"was made with {name} = {value}, and this fit has {needed[name]}",
                 where=where,

@@ -457,6 +457,20 @@ def test_no_gaussian_of_a_video_is_wide(made: Path) -> None:
         assert read_settings(said.method_settings()).max_scale == 0.005
 
 
+def test_opacities_of_a_videos_avatar_are_the_same_in_every_frame(made: Path) -> None:
+    """Oracle: another pose, other normals. Other attributes do change."""
+    network = load_avatar(made / "my_hand").model.network
+    count = len(network.initial("right"))
+    normals = torch.nn.functional.normalize(torch.randn(2, count, 3), dim=-1)
+    with torch.no_grad():
+        raw = network("right", normals, torch.randn(2, 16, 3)).raw
+    assert torch.equal(raw.logit_opacities[0], raw.logit_opacities[1])
+    assert not torch.equal(raw.logit_colors[0], raw.logit_colors[1])
+    for quick in (False, True):
+        assert not read_settings(VideoFit(quick=quick).method_settings()).network.frame_opacities
+    assert read_settings({}).network.frame_opacities
+
+
 def test_quick_takes_fewer_frames_and_smaller_fits() -> None:
     for count in (3, 100, 200, 299, 621, 1200, 5000):
         taken = len(range(0, count, stride(count, QUICK_FRAMES)))

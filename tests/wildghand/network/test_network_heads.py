@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import pytest
 import torch
 
 from wildghand.gaussians.attributes import CHANNELS
@@ -65,3 +68,16 @@ def test_bounds_hold_for_huge_features() -> None:
     assert pose.abs().max() <= SETTINGS.max_pose
     assert betas.abs().max() <= SETTINGS.max_betas
     assert transl.abs().max() <= SETTINGS.max_transl
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_opacities_follow_the_frame_only_where_they_are_asked_to(moves: bool) -> None:
+    """Oracle: the texture branch alone."""
+    x_t, x_g = inputs()
+    head = stirred(AttributeHead(replace(SETTINGS, frame_opacities=moves), TEXTURE, GEOMETRY))
+    hidden, latent = head.texture(x_t), x_t[:, :15]
+    raw = head(hidden, x_g, latent, start())
+    alone = head(hidden, None, latent, start())
+    for name, values in raw.items():
+        same = torch.allclose(values, getattr(alone, name).expand_as(values), atol=1e-9)
+        assert same == (name == "logit_opacities" and not moves), name
