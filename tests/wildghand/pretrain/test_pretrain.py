@@ -31,6 +31,7 @@ from wildghand.cli.main import main
 from wildghand.fitting.components import make_fit
 from wildghand.fitting.fit import Fit, StepBatch
 from wildghand.fitting.session import load_state, save_state
+from wildghand.from_video.run import VideoFit
 from wildghand.model.settings import read_settings
 from wildghand.network import network_settings
 from wildghand.plain.loop import Watchers, run_fit
@@ -272,6 +273,9 @@ def test_the_prior_that_ships_is_taken_where_it_fits(subjects: dict[str, Path]) 
     assert choose_prior(read_settings({"mode": "paper"}), hand_model) is not None
     assert choose_prior(read_settings({"network.size": "paper"}), hand_model) is None
     assert choose_prior(read_settings({"prior": ""}), hand_model) is None
+    # A video's fit has opacities of the other kind, of the same weights.
+    video = read_settings(VideoFit().method_settings())
+    assert choose_prior(video, hand_model) is not None
     with pytest.raises(BadInput, match="hand model anny"):
         choose_prior(read_settings({"prior": "priors/compact"}), HandModelId("mano", "0" * 64))
 
