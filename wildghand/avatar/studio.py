@@ -94,22 +94,18 @@ class HandAngles:
 
         They lie within the ranges. The palm faces the camera in all of them.
         """
-        found = {REST: np.zeros((len(JOINT_NAMES), 3))}
-        for name, shape in gestures().items():
-            fingers = finger_pose(shape, self._right.joints)
-            if self.side == "left":
-                fingers = mirrored(fingers)
-            pose = np.concatenate([self.upright.as_rotvec()[None], fingers])
-            found[name] = self.angles(pose).clip(self.lower, self.upper)
-        return found
+        shaped = {name: self._shaped(shape) for name, shape in gestures().items()}
+        return {REST: self.named_pose(REST), **shaped}
 
     def named_pose(self, name: str) -> np.ndarray:
         """Return the angles of one named pose."""
-        poses = self.named_poses()
-        if name not in poses:
-            known = f"Known: {', '.join(poses)}."
+        if name == REST:
+            return np.zeros((len(JOINT_NAMES), 3))
+        shapes = gestures()
+        if name not in shapes:
+            known = f"Known: {', '.join((REST, *shapes))}."
             raise UsageError(f"there is no pose {name[:40]!r}", field="pose", remedy=known)
-        return poses[name]
+        return self._shaped(shapes[name])
 
     def from_names(self, given: Mapping[str, float]) -> np.ndarray:
         """Return the angles of a hand at rest but for those that are named in `ANGLE_NAMES`."""
@@ -125,6 +121,14 @@ class HandAngles:
                 raise UsageError(problem, field="pose", remedy=remedy)
             angles[place] = degrees
         return angles
+
+    def _shaped(self, shape: np.ndarray) -> np.ndarray:
+        """The angles of an upright hand of a named shape, within the ranges."""
+        fingers = finger_pose(shape, self._right.joints)
+        if self.side == "left":
+            fingers = mirrored(fingers)
+        pose = np.concatenate([self.upright.as_rotvec()[None], fingers])
+        return self.angles(pose).clip(self.lower, self.upper)
 
 
 def _turn_to_upright(forward: np.ndarray, palmar: np.ndarray) -> Rotation:
