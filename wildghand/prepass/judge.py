@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from types import MappingProxyType
 
 import numpy as np
+import torch
 
 from hwp_bench.base.errors import BadInput
 from hwp_bench.hands.anchors import HandSurfaces
@@ -30,6 +32,7 @@ from wildghand.prepass.assessment import (
 )
 from wildghand.prepass.intensity import (
     LOWEST,
+    IntensityModel,
     IntensitySamples,
     Verdict,
     fit_intensity,
@@ -292,11 +295,11 @@ def _judge(
     samples = _intensity_samples([*frames.values()], quota)
     shown = shown_cells(frames.values(), len(cell_normals))
     model = fit_intensity(samples, cell_normals)
-    measured = {row: measure_frame(model, frame, shown) for row, frame in frames.items()}
+    measured = _measure(model, frames, shown)
     tolerance, compared = settings.tolerance, list[FrameMeasurements]()
     if known_clean is not None:
         known = _readable(_draw(known_clean, surfaces))
-        found = [measure_frame(model, frame, shown) for frame in known.values()]
+        found = [*_measure(model, known, shown).values()]
         if clean_share([*measured.values()], found, given.indices[usable], tolerance) < CLEAN_SHARE:
             compared = found
         else:
@@ -308,7 +311,7 @@ def _judge(
     # Pixels are compared with what clean frames show, which is known only now.
     verdict = Verdict(judged.clean[usable], model.gains)
     model = fit_intensity(samples, cell_normals, verdict)
-    measured = {row: measure_frame(model, frame, shown) for row, frame in frames.items()}
+    measured = _measure(model, frames, shown)
     weights = weigh_pixels(given.masks, measured, judged.clean, model.known)
     return replace(judged, pixel_weights=weights)
 
@@ -323,6 +326,18 @@ def _draw(given: PrepassInput, surfaces: HandSurfaces) -> dict[int, DrawnFrame]:
         row: DrawnFrame(footprint, given.images[row], given.masks[row])
         for row, footprint in zip(rows.tolist(), drawn, strict=True)
     }
+
+
+def _measure(
+    model: IntensityModel, frames: Mapping[int, DrawnFrame], shown: np.ndarray
+) -> dict[int, FrameMeasurements]:
+    """Compare frames with the intensity model, by row, on as many threads as torch has."""
+
+    def measure(frame: DrawnFrame) -> FrameMeasurements:
+        return measure_frame(model, frame, shown)
+
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        return dict(zip(frames, pool.map(measure, frames.values()), strict=True))
 
 
 def _readable(drawn: Mapping[int, DrawnFrame]) -> dict[int, DrawnFrame]:

@@ -220,11 +220,20 @@ def test_misplaced_hands_ask_for_refinement(lit_frames: Lit) -> None:
     assert judgement.clean[HIT].max() < judgement.clean[SPARED].min()
 
 
-def test_same_frames_same_judgement(lit_frames: Lit) -> None:
+def test_same_frames_same_judgement_on_any_number_of_threads(
+    lit_frames: Lit, monkeypatch: pytest.MonkeyPatch
+) -> None:
     given = as_input(developed(lit_frames[0]), lit_frames[1])
-    first, second = judge_frames(given), judge_frames(given)
+    first, second = (_judged_on(threads, given, monkeypatch) for threads in (1, 3))
     for field in fields(FrameAssessment):
         np.testing.assert_array_equal(getattr(first, field.name), getattr(second, field.name))
+
+
+def _judged_on(
+    threads: int, given: PrepassInput, monkeypatch: pytest.MonkeyPatch
+) -> FrameAssessment:
+    monkeypatch.setattr("torch.get_num_threads", lambda: threads)
+    return judge_frames(given)
 
 
 def test_many_pixels_are_judged_at_a_lower_resolution(
