@@ -32,7 +32,7 @@ from wildghand.plain.loop import IterativeFit
 #: Largest share of a budget that is kept for the end of a fit.
 MOST_OF_BUDGET = 0.5
 #: Most weight masks of an avatar, spread evenly over the clip.
-MAX_MASKS = 100
+MAX_MASKS = 40
 
 
 @dataclass(frozen=True, eq=False)

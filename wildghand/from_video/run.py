@@ -44,17 +44,17 @@ from wildghand.model.settings import nested
 FRAMES, QUICK_FRAMES = 300, 100
 #: What the avatar of a video has in place of the method's settings: no Gaussians so wide that they
 #: draw a rim outside of the hand, which a score hardly sees and a person does; opacities that are
-#: the same in every pose, or dark spots open in the palm in new ones; and half of the steps, after
-#: which kept-out frames of a clip of so many hardly gain.
+#: the same in every pose, or dark spots open in the palm in new ones; and a third of the steps,
+#: after which kept-out frames of a clip of so many gain nothing.
 VIDEO: Mapping[str, Any] = MappingProxyType(
     {
         "max_scale": 0.003,
         "network": {"frame_opacities": False},
-        "schedule": {"steps": 1000},
+        "schedule": {"steps": 600},
     }
 )
 #: What `quick` changes of the method's settings: fewer Gaussians, fewer steps.
-QUICK: Mapping[str, Any] = MappingProxyType({"gaussians": 5000, "schedule": {"steps": 400}})
+QUICK: Mapping[str, Any] = MappingProxyType({"gaussians": 5000, "schedule": {"steps": 250}})
 
 
 @dataclass(frozen=True)
