@@ -103,10 +103,10 @@ class FilledColors:
         model, clip, light = self.fit.model, self.fit.clip, self.fit.model.light
         if light is None or not self.fit.settings.visibility.fill_share:
             return [None] * len(shares)
-        logits = {side: known_logits(model, clip, side, light) for side in model.rigs}
-        levels = {side: log_linear(values) for side, values in logits.items()}
+        own = {side: known_colors(model, clip, side, light) for side in model.rigs}
+        levels = {side: colors.levels() for side, colors in own.items()}
         return [
-            changes_to(self._filled(levels, share), logits, self.fit.device)
+            changes_to(self._filled(levels, share), own, self.fit.device)
             if share > 0.0 or self._joined or any(bool(each.any()) for each in self.unseen.values())
             else None
             for share in shares
@@ -220,19 +220,42 @@ def _spread(sampler: PlaneSampler, values: Tensor, weights: Tensor) -> Tensor:
     return asked[:, :-1] / (asked[:, -1:] + _CELL)
 
 
+@dataclass(frozen=True, eq=False)
+class KnownColors:
+    """Colours of the N Gaussians of a hand: means over normals and poses that a clip knows."""
+
+    #: (N, 3) logits of sRGB, which `ColorChanges` change.
+    logits: np.ndarray
+    #: (N, 1) the network's shadow coefficients, by which the colours are multiplied.
+    shadow: np.ndarray
+
+    def levels(self, change: np.ndarray | float = 0.0) -> np.ndarray:
+        """(N, 3) logarithms of linear light, after a change of the logits."""
+        srgb = self.shadow / (1.0 + np.exp(-(self.logits + change)))
+        return np.log(np.clip(srgb_to_linear(srgb), _DARKEST, 1.0))
+
+    def change_to(self, levels: np.ndarray) -> np.ndarray:
+        """(N, 3) change of the logits that leads to other levels."""
+        # The shadow cannot be changed: a colour that is nearly white under a dark shadow needs a
+        # larger change than their product.
+        srgb = (linear_to_srgb(np.exp(levels)) / self.shadow).clip(_EDGE, 1.0 - _EDGE)
+        return np.asarray(np.log(srgb / (1.0 - srgb)) - self.logits)
+
+
 @torch.no_grad()
-def known_logits(
+def known_colors(
     model: WildGHandModel, clip: TrainingClip, side: str, light: KnownLight
-) -> np.ndarray:
-    """(N, 3) mean colour of each Gaussian over known normals and poses of the clip, in logits."""
+) -> KnownColors:
+    """Mean colours of a hand over the normals that a light knows, and over poses of the clip."""
     poses = clip.parameters[side][0]
     normals = known_normals(light).to(poses)
     rows = torch.linspace(0, len(poses) - 1, len(normals)).long().to(poses.device)
     spread = normals[:, None].expand(-1, len(model.rigs[side]), 3).contiguous()
     made = model.network(side, spread, poses[rows], model.network.features(side))
-    colors = (made.raw.logit_colors.sigmoid() * made.shadow).clamp(_EDGE, 1.0 - _EDGE)
-    found: np.ndarray = torch.logit(colors).mean(dim=0).double().cpu().numpy()
-    return found
+    logits, shadow = made.raw.logit_colors.mean(dim=0), made.shadow.clamp(min=_EDGE).log()
+    return KnownColors(
+        logits.double().cpu().numpy(), shadow.mean(dim=0).exp().double().cpu().numpy()
+    )
 
 
 def known_normals(light: KnownLight) -> Tensor:
@@ -243,27 +266,22 @@ def known_normals(light: KnownLight) -> Tensor:
     return torch.from_numpy(np.concatenate([axis[None], ring_around(axis, angle, _RING)])).float()
 
 
-def log_linear(logits: np.ndarray) -> np.ndarray:
-    """Return the logarithm of linear light of colours that are given as logits of sRGB."""
-    linear = srgb_to_linear(1.0 / (1.0 + np.exp(-logits)))
-    return np.log(np.clip(linear, _DARKEST, 1.0))
-
-
 def changes_to(
-    levels: Mapping[str, np.ndarray], logits: Mapping[str, np.ndarray], device: torch.device
+    levels: Mapping[str, np.ndarray], own: Mapping[str, KnownColors], device: torch.device
 ) -> ColorChanges:
-    """Return the changes that turn given colours into others.
+    """Return the changes that turn the own colours into others.
 
     Args:
         levels: (N, 3) by side, the wanted colours as logarithms of linear light.
-        logits: (N, 3) by side, the given colours as logits of sRGB.
+        own: by side.
     """
-    changes = {}
-    for side, aim in levels.items():
-        srgb = linear_to_srgb(np.exp(aim)).clip(_EDGE, 1.0 - _EDGE)
-        change = np.log(srgb / (1.0 - srgb)) - logits[side]
-        changes[side] = torch.as_tensor(change, dtype=torch.float32, device=device)
-    return ColorChanges(changes)
+    changes = {side: own[side].change_to(aim) for side, aim in levels.items()}
+    return ColorChanges(
+        {
+            side: torch.as_tensor(change, dtype=torch.float32, device=device)
+            for side, change in changes.items()
+        }
+    )
 
 
 def neighbours(rig: HandRig) -> np.ndarray:

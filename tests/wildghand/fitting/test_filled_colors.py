@@ -13,14 +13,14 @@ import torch
 from odd_fits import a_light, odd_fit, part
 from tiny_fits import UNJUDGED
 
+from hwp_bench.base.colors import srgb_to_linear
 from hwp_bench.hands import load_template
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.avatar.files import load_avatar, save_avatar
 from wildghand.fitting.colors import (
     FilledColors,
-    known_logits,
+    known_colors,
     known_normals,
-    log_linear,
     roughness,
     smooth_fill,
 )
@@ -51,8 +51,7 @@ def begun(training: TrainingCapture, **changes: Any) -> Fit:
 
 def levels(fit: Fit, side: str, change: torch.Tensor | float = 0.0) -> np.ndarray:
     """Log linear light of the colours, with a change of the logits."""
-    logits = known_logits(fit.model, fit.clip, side, a_light())
-    return log_linear(logits + np.asarray(change, dtype=np.float64))
+    return known_colors(fit.model, fit.clip, side, a_light()).levels(np.asarray(change))
 
 
 def test_the_form_sums_squared_differences_of_neighbours(rig: HandRig) -> None:
@@ -219,10 +218,42 @@ def test_skin_that_no_frame_shows_takes_the_colours_around_it_with_any_share(
     seen = ~unseen.numpy()
     shifted = levels(fit, "right")
     np.testing.assert_allclose(after[seen], shifted[seen], atol=1e-3)
-    # The oracle: a fill that knows nothing there and all elsewhere.
+    # The oracle: a fill that knows nothing there and all elsewhere, under the shadows of there.
     expected = smooth_fill(roughness(rig), shifted, seen.astype(float))
-    np.testing.assert_allclose(after, expected, atol=1e-3)
+    own = known_colors(fit.model, fit.clip, "right", a_light())
+    white = own.levels(math.log(0.995 / 0.005) - own.logits)
+    np.testing.assert_allclose(after, np.minimum(expected, white), atol=1e-3)
     assert np.abs(after[~seen] - before[~seen]).max() > 0.01
+
+
+def test_what_is_nearly_white_before_the_shadow_is_filled_too(make_training: TrainingMaker) -> None:
+    """Oracle: the fill, and the colours that the network has when drawn, under its shadows."""
+    fit = begun(make_training("right"))
+    rig, model = fit.model.rigs["right"], fit.model
+    places = rest_anchors(rig)[0][:, 0]
+    unseen = torch.from_numpy(places < np.median(places))
+    hidden = unseen.numpy()
+    to_map = torch.linalg.pinv(model.network.attribute_head.direct.weight[COLORS, COLORS])
+    chart = model.network.charts["right"]
+    with torch.no_grad():
+        # A network that found nothing wrong with white there.
+        asked = chart.identity.transposed(6.0 * unseen[:, None].float().expand(-1, 3))
+        model.network.identity.maps["right"][:, COLORS] += asked.clamp(max=6.0) @ to_map.mT
+    filled = FilledColors(fit, {"right": torch.full((len(rig),), 10.0)}, {"right": unseen})
+    (found,) = filled.carried_on([0.0])
+    assert found is not None
+    normals = known_normals(a_light())[:, None].expand(-1, len(rig), 3).contiguous()
+    with torch.no_grad():
+        made = model.network("right", normals, fit.clip.parameters["right"][0][:5])
+        drawn = [
+            (each.logit_colors.sigmoid() * made.shadow).numpy()
+            for each in (made.raw, found.color("right", made.raw))
+        ]
+    before, after = (np.log(srgb_to_linear(each[:, hidden])).mean() for each in drawn)
+    filling = smooth_fill(roughness(rig), levels(fit, "right"), (~hidden).astype(float))
+    expected = filling[hidden].mean()
+    assert before > expected + 0.4
+    assert after == pytest.approx(expected, abs=0.1)
 
 
 def test_known_normals_lie_in_the_cap() -> None:
