@@ -50,8 +50,8 @@ _COLORS = slice(CHANNELS - SIZES["logit_colors"], CHANNELS)
 # Normals at which colours are read: the axis of the cap that the light knows, and so many around it
 # at this share of the cap's angle.
 _RING, _INSIDE = 4, 0.6
-# sRGB nearer to 0 or 1, and linear light below this, say nothing.
-_EDGE, _DARKEST = 0.005, 1e-3
+# sRGB nearer to 0 or 1, linear light below this, and logits beyond say nothing.
+_EDGE, _DARKEST, _WHITE = 0.005, 1e-3, 12.0
 # A colour that is somebody's is better than none: it takes so much less to be lent.
 _LENT = 0.25
 _OTHER = {"left": "right", "right": "left"}
@@ -252,10 +252,9 @@ def known_colors(
     rows = torch.linspace(0, len(poses) - 1, len(normals)).long().to(poses.device)
     spread = normals[:, None].expand(-1, len(model.rigs[side]), 3).contiguous()
     made = model.network(side, spread, poses[rows], model.network.features(side))
-    logits, shadow = made.raw.logit_colors.mean(dim=0), made.shadow.clamp(min=_EDGE).log()
-    return KnownColors(
-        logits.double().cpu().numpy(), shadow.mean(dim=0).exp().double().cpu().numpy()
-    )
+    logits = made.raw.logit_colors.clamp(-_WHITE, _WHITE).mean(dim=0)
+    shadow = made.shadow.clamp(min=_EDGE).log().mean(dim=0).exp()
+    return KnownColors(logits.double().cpu().numpy(), shadow.double().cpu().numpy())
 
 
 def known_normals(light: KnownLight) -> Tensor:

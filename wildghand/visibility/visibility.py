@@ -47,8 +47,8 @@ class VisibilitySettings:
 
 _WALLS = "visibility_wall_"
 # The disc: standard deviations along the skin and across it, in spacings of the anchors, and its
-# opacity before the sigmoid.
-_WIDE, _THIN, _OPAQUE = 0.6, 0.2, 4.0
+# opacity before the sigmoid. Anchors are not even: narrower discs leave gaps.
+_WIDE, _THIN, _OPAQUE = 0.9, 0.2, 4.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from unittest import mock
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -13,11 +14,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tiny_fits import UNJUDGED
 
+from hwp_bench.hands import load_template, pose_hand, project
+from hwp_bench.hands.raster import draw_silhouette
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.avatar.files import load_avatar, save_avatar
+from wildghand.avatar.studio import HandAngles
 from wildghand.fitting.components import make_fit
 from wildghand.gaussians.attributes import Activation, RawAttributes
+from wildghand.gaussians.rig import make_rig
 from wildghand.model.settings import read_settings
+from wildghand.splat import rasterize
 from wildghand.visibility import (
     ColorChanges,
     Visibility,
@@ -58,11 +64,46 @@ def test_without_visibility_gaussians_are_opaque_discs_on_the_skin_in_their_colo
     settled = visibility(0.0, 0.0).settle("right", raw, SPACING, activation.log_scale_bias)
     drawn = activation(settled)
     assert not drawn.offsets.any()
-    disc = torch.tensor([0.6, 0.6, 0.2]) * SPACING
+    disc = torch.tensor([0.9, 0.9, 0.2]) * SPACING
     torch.testing.assert_close(drawn.scales, disc.expand_as(drawn.scales))
     torch.testing.assert_close(drawn.quats[..., 0], torch.ones(2, 40))
     assert drawn.opacities.min() > 0.98
     torch.testing.assert_close(drawn.colors, activation(raw).colors)
+
+
+@pytest.mark.parametrize("turn", [0.0, 180.0])
+def test_discs_alone_cover_the_skin(turn: float) -> None:
+    """Oracle: the outline of the posed mesh, 3 px inside of which nothing may shine through."""
+    template, angles = load_template("anny", "right"), HandAngles.of("anny", "right")
+    pose = torch.from_numpy(angles.pose(angles.from_names({"wrist twist": turn}))).float()[None]
+    betas, transl = torch.zeros(10), torch.tensor([[0.0, 0.0, 0.6]])
+    rig, activation = make_rig(template, 12_337), Activation()
+    place = rig.pose(pose, betas, transl)
+    settled = visibility(0.0, 0.0, len(rig)).settle(
+        "right", raw_attributes(len(rig)), rig.spacing, activation.log_scale_bias
+    )
+    discs = activation(settled)
+    # The camera looks along z at the middle of the hand.
+    middle = place.positions[0].mean(dim=0)
+    K = torch.tensor([[[600.0, 0.0, 128.0], [0.0, 600.0, 128.0], [0.0, 0.0, 1.0]]])
+    K[0, :2, 2] -= 1000.0 * middle[:2]
+    _, coverage, _ = rasterize(
+        place.positions,
+        place.orientations,
+        discs.scales[:1],
+        discs.opacities[:1],
+        torch.ones(1, len(rig), 3),
+        torch.eye(4)[None],
+        K,
+        256,
+        256,
+    )
+    posed = pose_hand(template.to_torch(), pose, betas, transl).vertices
+    pixels, _ = project(posed, torch.eye(4)[None], K)
+    drawn = draw_silhouette(pixels[0].double().numpy(), template.faces, 256)
+    inside = cv2.erode((drawn > 0).astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    assert inside.sum() > 5_000
+    assert coverage[0, ..., 0].numpy()[inside].min() > 0.95
 
 
 def test_skin_that_no_frame_shows_is_as_learnt_from_behind_and_discs_from_the_front() -> None:
