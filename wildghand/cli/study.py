@@ -176,11 +176,11 @@ def _add_network(parser: argparse.ArgumentParser) -> None:
 
 def _do_network(args: argparse.Namespace) -> int:
     from hwp_bench.base.tables import Column, Table, print_table
-    from wildghand.network.network import blank_network, parameter_table
+    from wildghand.network.network import parameter_table, small_network
     from wildghand.network.settings import network_settings
 
     settings = network_settings(args.size)
-    rows = parameter_table(blank_network(settings))
+    rows = parameter_table(small_network(settings))
     parts: dict[str, int] = {}
     for row in rows:
         parts[row.part] = parts.get(row.part, 0) + row.parameters

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -297,16 +298,15 @@ def parameter_table(network: PredictionNetwork) -> tuple[LayerRow, ...]:
     return tuple(LayerRow(*key, times) for key, times in counted.items())
 
 
-def blank_network(settings: NetworkSettings) -> PredictionNetwork:
-    """A network of both hands without memory for its weights: enough to count them."""
+def small_network(settings: NetworkSettings) -> PredictionNetwork:
+    """A network of both hands with a single anchor each: it has all weights, and draws nothing."""
     dot = SurfacePoints(
         uv=torch.full((1, 2), 0.5),
         positions=torch.zeros(1, 3),
         spacing=1e-3,
         color=torch.full((3,), 0.5),
     )
-    with torch.device("meta"):
-        return PredictionNetwork(settings, {"left": dot, "right": dot})
+    return PredictionNetwork(settings, {"left": dot, "right": dot})
 
 
 #: Start of the names of identity maps in a network's state.
@@ -321,5 +321,12 @@ def shapes_of(network: PredictionNetwork) -> dict[str, torch.Size]:
 
 
 def shapes_of_settings(settings: NetworkSettings) -> dict[str, torch.Size]:
-    """The same where there is no network yet; the first time takes a second."""
-    return shapes_of(blank_network(settings))
+    """The same where there is no network yet.
+
+    The settings may be a stranger's, and the identity map is what can fill the memory, so that it
+    is not made.
+    """
+    smallest = dataclasses.replace(settings, identity_resolution=4)
+    of_map = torch.Size((settings.identity_resolution**2, settings.identity_channels))
+    shapes = shapes_of(small_network(smallest))
+    return {name: of_map if name.startswith(MAPS) else shape for name, shape in shapes.items()}

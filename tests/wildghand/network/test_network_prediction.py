@@ -30,7 +30,12 @@ from wildghand.network import (
     parameter_groups,
     surface_points,
 )
-from wildghand.network.network import blank_network, parameter_table
+from wildghand.network.network import (
+    parameter_table,
+    shapes_of,
+    shapes_of_settings,
+    small_network,
+)
 
 COLOR = torch.tensor([0.6, 0.45, 0.4])
 SMALL: dict[str, dict[str, Any]] = {
@@ -315,16 +320,29 @@ def test_paper_counts_by_hand() -> None:
     wanted |= head("template_head.offsets", 608 + 18, 256, 256, 3)
     wanted |= head("refinement_head.frame", 2 * 608, 256, 256, 16 * 3 + 3)
     wanted |= head("refinement_head.shape", 608, 256, 256, 10)
-    rows = parameter_table(blank_network(network_settings("paper")))
+    rows = parameter_table(small_network(network_settings("paper")))
     assert {row.layer: row.parameters for row in rows} == wanted
 
 
 @pytest.mark.parametrize("size", ["compact", "paper"])
 def test_the_table_leaves_nothing_out(size: str) -> None:
-    network = blank_network(network_settings(size))
-    assert all(parameter.is_meta for parameter in network.parameters())
+    network = small_network(network_settings(size))
     total = sum(parameter.numel() for parameter in network.parameters())
     assert sum(row.parameters for row in parameter_table(network)) == total
+
+
+@pytest.mark.parametrize("size", ["compact", "paper"])
+def test_shapes_are_known_without_the_network(size: str) -> None:
+    chosen = network_settings(size, identity_resolution=12, plane_resolution=16)
+    assert shapes_of_settings(chosen) == shapes_of(small_network(chosen))
+
+
+def test_shapes_of_a_large_map_take_no_memory() -> None:
+    # 2.2 GB for each hand, if it were made.
+    with torch.profiler.profile(profile_memory=True) as measured:
+        shapes = shapes_of_settings(network_settings(identity_resolution=4096))
+    assert shapes["identity.maps.right"] == (4096**2, 33)
+    assert max(event.cpu_memory_usage for event in measured.events()) < 64 << 20
 
 
 @pytest.mark.parametrize("size", ["compact", "paper"])
