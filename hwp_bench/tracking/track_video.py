@@ -2,8 +2,9 @@
 
 A hand that was seen in the last frame is looked for around the place where it was; palms are
 searched only while fewer hands are followed than may be there. Source: MediaPipe's graph
-`hand_landmark_tracking_cpu`. Two tracks that end on one hand are made one here, which only the
-newer Tasks of MediaPipe do.
+`hand_landmark_tracking_cpu`. Two things differ: next to a hand that is followed without a gap, a
+second one is searched in every fifth frame only; and two tracks that end on one hand are made one,
+as the newer Tasks of MediaPipe do.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from hwp_bench.base.errors import HwpError, UsageError
 from hwp_bench.base.images import write_image
 from hwp_bench.hands.raster import draw_dots
 from hwp_bench.hands.skeleton import draw_bones
+from hwp_bench.importers.shared.frames import ahead
 from hwp_bench.importers.shared.landmarks import HandTracks, write_hand_tracks
 from hwp_bench.importers.video.decode import (
     FrameRange,
@@ -51,6 +53,9 @@ from hwp_bench.tracking.networks import (
 _SAME_REGION = 0.5
 #: Two hands are one if their landmarks differ by less than this share of their size, on average.
 _SAME_HAND = 0.2
+#: While a hand is followed, palms are searched in one of so many frames, and in all of so many
+#: after a hand was lost.
+_PALMS_EVERY, _PALMS_AFTER = 5, 15
 
 
 @dataclass(frozen=True)
@@ -91,6 +96,8 @@ class HandTracker:
         self._settings = settings or TrackerSettings()
         self._followed: list[TrackedHand] = []
         self._tracks = 0
+        # The number of the frame, and of the last one in which a hand was lost.
+        self._frame, self._lost = 0, -_PALMS_AFTER
 
     def step(self, frame: np.ndarray) -> list[TrackedHand]:
         """Find the hands of the next frame, (H, W, 3) uint8 RGB; known ones keep their tracks."""
@@ -107,6 +114,7 @@ class HandTracker:
             moved = np.inf if before is None else _distance(hand, before.hand)
             track = -1 if before is None else before.track
             seen.append((TrackedHand(track, hand), moved))
+        known = len(self._followed)
         self._followed = []
         for one in _without_doubles(seen)[: self._settings.hands]:
             number = one.track
@@ -114,6 +122,9 @@ class HandTracker:
                 # A new track.
                 number, self._tracks = self._tracks, self._tracks + 1
             self._followed.append(TrackedHand(number, one.hand))
+        if len(self._followed) < known:
+            self._lost = self._frame
+        self._frame += 1
         return list(self._followed)
 
     def _regions(self, frame: np.ndarray) -> list[tuple[Region, TrackedHand | None]]:
@@ -124,7 +135,9 @@ class HandTracker:
             if _is_sound(region, frame):
                 followed = [one for one in followed if overlap(one[0], region) <= _SAME_REGION]
                 followed.append((region, hand))
-        for region in self._new_regions(frame) if len(followed) < self._settings.hands else ():
+        due = self._frame % _PALMS_EVERY == 0 or self._frame - self._lost <= _PALMS_AFTER
+        searched = len(followed) < self._settings.hands and (due or not followed)
+        for region in self._new_regions(frame) if searched else ():
             if all(overlap(region, other) <= _SAME_REGION for other, _ in followed):
                 followed.append((region, None))
         return followed
@@ -352,7 +365,7 @@ def track_video(
     began = time.perf_counter()
     endings: list[Reading] = []
     with progress("tracking hands", max(info.stated_frames, 1)) as update:
-        frames = (frame for _, frame in read_frames(info, FrameRange(), endings.append))
+        frames = (frame for _, frame in ahead(read_frames(info, FrameRange(), endings.append)))
         collected = track_frames(frames, networks, settings, update)
     warn_of_damage(info, endings[0])
     hands = collected.hands((info.width, info.height), settings.hands)

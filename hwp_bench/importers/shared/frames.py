@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TypeVar
@@ -146,3 +147,20 @@ def each_frame(work: Callable[[Frame], Result], frames: Iterable[Frame]) -> Iter
         finally:
             for future in running:
                 future.cancel()
+
+
+def ahead(frames: Generator[Frame]) -> Iterator[Frame]:
+    """Compute the next frame in another thread while the caller works on this one.
+
+    All of the generator runs in that thread, its end too.
+    """
+    with ThreadPoolExecutor(1) as pool:
+        running = deque(pool.submit(next, frames, None) for _ in range(2))
+        try:
+            while (frame := running.popleft().result()) is not None:
+                running.append(pool.submit(next, frames, None))
+                yield frame
+        finally:
+            for future in running:
+                future.cancel()
+            pool.submit(frames.close).result()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -17,7 +17,7 @@ from hwp_bench.base.console import notice
 from hwp_bench.base.errors import BadInput, UsageError, bounded, check_name
 from hwp_bench.base.files import check_is_file
 from hwp_bench.base.images import MAX_PIXELS, read_gray
-from hwp_bench.importers.shared.frames import CropWindows, cut, resample
+from hwp_bench.importers.shared.frames import CropWindows, ahead, cut, resample
 from hwp_bench.importers.video.colours import Colours, colours_of, to_srgb
 
 
@@ -208,7 +208,7 @@ def read_images(
     frames = np.zeros((count, windows.size, windows.size, 3), dtype=np.uint8)
     working = np.zeros((count, edge, edge, 3), dtype=np.uint8)
     done = 0
-    for _, image in read_frames(info, selection, ended):
+    for _, image in ahead(read_frames(info, selection, ended)):
         if done < count:
             square = cut(image, windows.corners[done], windows.side)
             frames[done] = resample(square, windows.size)
@@ -263,7 +263,7 @@ def read_masks(
 
 def read_frames(
     info: VideoInfo, selection: FrameRange, ended: Callable[[Reading], None] | None = None
-) -> Iterator[tuple[int, np.ndarray]]:
+) -> Generator[tuple[int, np.ndarray]]:
     """Decode the selected frames: yields the index in the video, and (H, W, 3) uint8 sRGB.
 
     Those between are decoded and dropped, because seeking is not exact in every container. `ended`

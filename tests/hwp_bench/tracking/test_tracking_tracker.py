@@ -45,14 +45,25 @@ def test_one_hand_is_found_lost_and_found_again() -> None:
 
 
 def test_palms_are_searched_only_while_a_hand_is_missing() -> None:
-    one: Clip = [{"right": (60, 60)}] * 6
+    one: Clip = [{"right": (60, 60)}] * 11
     networks = FakeNetworks()
     hands_of(one, networks, hands=1)
     assert networks.palm_calls == 1
     networks = FakeNetworks()
     hands_of(one, networks, hands=2)
-    assert networks.palm_calls == 6
-    assert networks.hand_calls == 6
+    # Frames 0, 5 and 10.
+    assert networks.palm_calls == 3
+    assert networks.hand_calls == 11
+
+
+def test_a_lost_hand_is_searched_in_every_frame() -> None:
+    both = {"left": (40, 60), "right": (120, 60)}
+    clip: Clip = [both] * 7 + [{"left": (40, 60)}] * 4 + [both] * 3
+    tracks = hands_of(clip, FakeNetworks())
+    assert tracks is not None
+    right = tracks.hand_of("right")
+    assert right is not None
+    np.testing.assert_array_equal(tracks.seen(right), [k < 7 or k >= 11 for k in range(14)])
 
 
 def test_two_hands_that_cross_keep_their_sides() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
+from collections.abc import Generator
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from synthetic_clip import FOCAL, HEIGHT, WIDTH, make_clip
 from hwp_bench.importers.shared.frames import (
     MOST_THREADS,
     CropWindows,
+    ahead,
     cut,
     each_frame,
     follow_hands,
@@ -103,3 +105,46 @@ def test_few_results_are_held_and_an_error_ends_the_work() -> None:
     with pytest.raises(ValueError, match="frame 3"):
         list(found)
     assert len(begun) < 20 * MOST_THREADS
+
+
+def test_the_next_frame_is_computed_meanwhile_in_one_thread() -> None:
+    threads, reached = set(), threading.Event()
+
+    def frames() -> Generator[int]:
+        try:
+            for frame in range(5):
+                if frame == 1:
+                    reached.set()
+                threads.add(threading.get_ident())
+                yield frame
+        finally:
+            threads.add(threading.get_ident())
+
+    found = ahead(frames())
+    assert next(found) == 0
+    assert reached.wait(300.0)  # nobody has asked for frame 1
+    assert list(found) == [1, 2, 3, 4]
+    assert threads != {threading.get_ident()}
+    assert len(threads) == 1
+
+
+def test_an_error_ahead_comes_in_its_place_and_a_reader_may_leave() -> None:
+    ended = threading.Event()
+
+    def frames() -> Generator[int]:
+        try:
+            yield 0
+            yield 1
+            raise ValueError("frame 2")
+        finally:
+            ended.set()
+
+    found = ahead(frames())
+    assert [next(found), next(found)] == [0, 1]
+    with pytest.raises(ValueError, match="frame 2"):
+        next(found)
+    ended.clear()
+    for frame in ahead(frames()):
+        assert frame == 0
+        break
+    assert ended.wait(300.0)
