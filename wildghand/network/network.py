@@ -323,7 +323,7 @@ def shapes_of(network: PredictionNetwork) -> dict[str, torch.Size]:
 def shapes_of_settings(settings: NetworkSettings) -> dict[str, torch.Size]:
     """The same where there is no network yet.
 
-    The settings may be a stranger's, and the identity map is what can fill the memory, so that it
+    The settings may come from others, and the identity map is what can fill the memory, so that it
     is not made.
     """
     smallest = dataclasses.replace(settings, identity_resolution=4)
