@@ -44,13 +44,13 @@ from wildghand.model.settings import nested
 FRAMES, QUICK_FRAMES = 300, 100
 #: What the avatar of a video has in place of the method's settings: no Gaussians so wide that they
 #: draw a rim outside of the hand, which a score hardly sees and a person does; opacities that are
-#: the same in every pose, or dark spots open in the palm in new ones; and a third of the steps,
+#: the same in every pose, or dark spots open in the palm in new ones; and a fifth of the steps,
 #: after which kept-out frames of a clip of so many gain nothing.
 VIDEO: Mapping[str, Any] = MappingProxyType(
     {
         "max_scale": 0.003,
         "network": {"frame_opacities": False},
-        "schedule": {"steps": 600},
+        "schedule": {"steps": 400},
     }
 )
 #: What `quick` changes of the method's settings: fewer Gaussians, fewer steps.
