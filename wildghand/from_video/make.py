@@ -221,7 +221,7 @@ def fit(
         source: a video, a capture, or a capture's folder.
         out: the avatar folder to make. None writes nothing for a capture; for a video it is
             `hand_avatar` next to `hand.mp4`.
-        quick: an avatar in under half of the time: fewer frames of a video, Gaussians and steps.
+        quick: an avatar in about half of the time: fewer frames of a video, Gaussians and steps.
         settings: settings that override the defaults, such as `{"gaussians": 5000}`; the fields
             of `WildGHandSettings`, dotted for those of a component.
         seconds: limit of the fit, s.

@@ -73,7 +73,7 @@ class VideoFit:
     landmarks: Path | None = None
     #: The tracker's networks (`hwp_bench.tracking.networks.load_models`), or None for the cache.
     tracker: Path | None = None
-    #: An avatar in under half of the time: fewer frames, Gaussians and steps.
+    #: An avatar in about half of the time: fewer frames, Gaussians and steps.
     quick: bool = False
     #: Fit every frame. False leaves the last fifth out, for a score.
     all_frames: bool = True
