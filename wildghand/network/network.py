@@ -323,10 +323,14 @@ def shapes_of(network: PredictionNetwork) -> dict[str, torch.Size]:
 def shapes_of_settings(settings: NetworkSettings) -> dict[str, torch.Size]:
     """The same where there is no network yet.
 
-    The settings may come from others, and the identity map is what can fill the memory, so that it
-    is not made.
+    The settings may come from others. What grows with a resolution could fill the memory, so it is
+    made small: the identity maps, and the position of each cell in `paper`.
     """
-    smallest = dataclasses.replace(settings, identity_resolution=4)
-    of_map = torch.Size((settings.identity_resolution**2, settings.identity_channels))
+    smallest = dataclasses.replace(settings, identity_resolution=4, plane_resolution=4)
     shapes = shapes_of(small_network(smallest))
-    return {name: of_map if name.startswith(MAPS) else shape for name, shape in shapes.items()}
+    for name, shape in shapes.items():
+        if name.startswith(MAPS):
+            shapes[name] = torch.Size((settings.identity_resolution**2, *shape[1:]))
+        elif name.endswith(".coder.position"):
+            shapes[name] = torch.Size((settings.plane_resolution**2, *shape[1:]))
+    return shapes

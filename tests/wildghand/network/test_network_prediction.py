@@ -337,10 +337,12 @@ def test_shapes_are_known_without_the_network(size: str) -> None:
     assert shapes_of_settings(chosen) == shapes_of(small_network(chosen))
 
 
-def test_shapes_of_a_large_map_take_no_memory() -> None:
-    # 2.2 GB for each hand, if it were made.
+@pytest.mark.parametrize("size", ["compact", "paper"])
+def test_shapes_of_the_largest_settings_take_little_memory(size: str) -> None:
+    # The map alone would take 2.2 GB for each hand.
+    largest = network_settings(size, identity_resolution=4096, plane_resolution=512)
     with torch.profiler.profile(profile_memory=True) as measured:
-        shapes = shapes_of_settings(network_settings(identity_resolution=4096))
+        shapes = shapes_of_settings(largest)
     assert shapes["identity.maps.right"] == (4096**2, 33)
     assert max(event.cpu_memory_usage for event in measured.events()) < 64 << 20
 
