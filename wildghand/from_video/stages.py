@@ -204,8 +204,8 @@ class TrackStage(Stage):
             ) from error
 
     def expected(self, job: VideoJob) -> float:
-        # A frame of 720p takes 16 ms.
-        return 0.0 if job.options.landmarks else 1.0 + 0.016 * _frame_count(job)
+        # A frame of 720p takes 18 ms.
+        return 0.0 if job.options.landmarks else 1.0 + 0.018 * _frame_count(job)
 
 
 class Import(Stage):
