@@ -71,8 +71,8 @@ class Standing:
     mean: float
     #: Standard deviation of that mean over seeds; None with one seed.
     seed_deviation: float | None
-    #: Number of seeds.
-    seeds: int
+    #: The seeds, rising.
+    seeds: tuple[int, ...]
     #: Letters; two methods that share one do not differ significantly.
     ties: str
 
@@ -163,7 +163,7 @@ def standings(
             run.label,
             float(mean.mean()),
             float(mean.std(ddof=1)) if len(mean) > 1 else None,
-            len(mean),
+            tuple(sorted(run.seeds)),
             ties,
         )
         for (run, mean), ties in zip(means, tie_groups(len(means), different), strict=True)
@@ -248,9 +248,9 @@ class Rank:
     standing: Standing
     #: 1 for the best mean; equal means share the smaller number.
     rank: int
-    #: Best rank that the data allow.
+    #: Best and worst rank that the data allow. Means are over all seeds and tests over common ones:
+    #: where they contradict each other, the data allow the rank of the mean too.
     best: int
-    #: Worst rank that the data allow.
     worst: int
     #: This method less the leader; None for the leader itself.
     behind: Estimate | None
@@ -303,12 +303,13 @@ def rank_methods(
     ranks = []
     for own in order:
         against = [signs[own.label, other.label] for other in order if other is not own]
+        rank = 1 + sum(direction * other.mean > direction * own.mean for other in order)
         ranks.append(
             Rank(
                 own,
-                1 + sum(direction * other.mean > direction * own.mean for other in order),
-                1 + against.count(-1),
-                len(order) - against.count(1),
+                rank,
+                min(rank, 1 + against.count(-1)),
+                max(rank, len(order) - against.count(1)),
                 leads[own.label, order[0].label] if own is not order[0] else None,
             )
         )
@@ -335,7 +336,7 @@ def verdict(ranking: Ranking) -> str:
     """Return one sentence: who wins by how much and how surely, or who ties.
 
     A method wins where it is significantly better than every other one. Otherwise the methods that
-    tie with the leader are named.
+    tie with the leader are named, and those that are better over the seeds that both have.
     """
     first, *rest = ranking.ranks
     facts = metric_facts(ranking.metric)
@@ -363,19 +364,35 @@ def verdict(ranking: Ranking) -> str:
             f"{first.standing.label} leads with {mean} (macro mean): {text}; nothing says how sure."
         )
     label = first.standing.label
-    told_apart = {
-        name
-        for item in ranking.differences
-        if _differs(item, len(ranking.ranks))
-        for name in (item.first, item.second)
-        if label in (item.first, item.second)
-    }
-    tied = [item.standing.label for item in rest if item.standing.label not in told_apart]
-    return (
-        f"No clear winner: {label} leads with {mean} (macro mean), {text}, and "
-        f"is tied with {', '.join(tied)} (not significantly different"
-        + (f", Bonferroni over the {len(rest)} pairs of the leader)." if rest[1:] else ").")
+    ahead, behind = _significant(ranking, label)
+    tied = [one.standing.label for one in rest if one.standing.label not in ahead | behind]
+    better = [one.standing.label for one in rest if one.standing.label in behind]
+    found = []
+    if better:
+        names = ", ".join(better)
+        found.append(f"is significantly behind {names} over the seeds that both have")
+    if tied:
+        found.append(f"is tied with {', '.join(tied)} (not significantly different")
+        found[-1] += f", Bonferroni over the {len(rest)} pairs of the leader)" if rest[1:] else ")"
+    return f"No clear winner: {label} leads with {mean} (macro mean), {text}, and " + (
+        ", and ".join(found) + "."
     )
+
+
+def _significant(ranking: Ranking, label: str) -> tuple[set[str], set[str]]:
+    """The labels of the methods that one is significantly better than, and worse than."""
+    ahead: set[str] = set()
+    behind: set[str] = set()
+    direction = 1.0 if metric_facts(ranking.metric).higher_is_better else -1.0
+    for item in ranking.differences:
+        if not _differs(item, len(ranking.ranks)):
+            continue
+        lead = direction * item.estimate.value
+        if item.first == label:
+            (ahead if lead > 0 else behind).add(item.second)
+        elif item.second == label:
+            (behind if lead > 0 else ahead).add(item.first)
+    return ahead, behind
 
 
 _INTERVAL = (
@@ -425,7 +442,7 @@ def standings_table(metric: str, found: Sequence[Standing]) -> Table:
         (Column("Method"), [one.label for one in found]),
         (score_column(metric), [one.mean for one in found]),
         (Column("Ties"), [one.ties for one in found]),
-        (Column("Seeds", 0), [one.seeds for one in found]),
+        (Column("Seeds", 0), [len(one.seeds) for one in found]),
         (Column("Spread over seeds", facts.digits + 1), [one.seed_deviation for one in found]),
     ]
     note = (

@@ -52,7 +52,7 @@ def rank_table(runs: Sequence[MethodRuns]) -> Table:
     for name in others:
         means = [macro_mean(by_label[item.standing.label], name) for item in ranks]
         columns.append((score_column(name), means))
-    columns.append((Column("Seeds", 0), [item.standing.seeds for item in ranks]))
+    columns.append((Column("Seeds", 0), [len(item.standing.seeds) for item in ranks]))
     notes = (
         verdict(ranking),
         "Macro means. Interval of a rank: what a method's significant differences leave "

@@ -93,7 +93,11 @@ def test_seeds_of_one_method_are_one_method() -> None:
     found = compare(runs, "psnr", resamples=500)
     assert found[0].estimate.value == pytest.approx(1.5)
     first = standings(runs, "psnr", found)[0]
-    assert (first.label, first.seeds, first.seed_deviation) == ("Mine", 3, pytest.approx(1.0))
+    assert (first.label, first.seeds, first.seed_deviation) == (
+        "Mine",
+        (0, 1, 2),
+        pytest.approx(1.0),
+    )
     with pytest.raises(UsageError, match="two results are of Mine with seed 2"):
         group_runs([made[0], made[0]])
     with pytest.raises(UsageError, match="have no seed in common"):
@@ -235,6 +239,24 @@ def test_uneven_seeds_are_named() -> None:
     ranking = rank_methods(group_runs(rows), "psnr", resamples=200)
     assert ranking.ranks[0].standing.mean == pytest.approx(31.0)
     assert "+9.00 dB against B, the next" in verdict(ranking)
+    assert "over the seeds that both have" in verdict(ranking)
+
+
+def test_a_leader_that_common_seeds_contradict_is_no_clear_one() -> None:
+    """A's other seeds lift its mean above B's; with the seed that both have B is better."""
+    rows = [made_results("a", lambda c, f, s: 28.0 + 9 * s + c % 2, seed=s) for s in (0, 1)]
+    rows.append(made_results("b", lambda c, f, s: 30.0 + c % 2))
+    ranking = rank_methods(group_runs(rows), "psnr", resamples=200)
+    found = [(r.standing.label, r.rank, r.best, r.worst) for r in ranking.ranks]
+    assert found == [("A", 1, 1, 2), ("B", 2, 1, 2)]
+    text = verdict(ranking)
+    assert text.startswith("No clear winner: A leads")
+    assert text.endswith("and is significantly behind B over the seeds that both have.")
+    assert "tied" not in text
+    # As many seeds, but others.
+    rows = [made_results("a", lambda c, f, s: 30.0 + c % 2, seed=s) for s in (0, 1)]
+    rows += [made_results("b", lambda c, f, s: 20.0 + c, seed=s) for s in (1, 2)]
+    ranking = rank_methods(group_runs(rows), "psnr", resamples=200)
     assert "over the seeds that both have" in verdict(ranking)
 
 
