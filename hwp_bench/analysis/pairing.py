@@ -11,7 +11,7 @@ from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import sha256_json
 from hwp_bench.metrics.score import CaptureScores, Scores, aggregate
 from hwp_bench.results import Results
-from hwp_bench.results.schema import differing_makers, differing_settings
+from hwp_bench.results.schema import CaptureResult, differing_makers, differing_settings
 from hwp_bench.taxonomy import PERTURBATIONS
 
 #: Scope of the headline: every perturbation counts the same, as the macro mean of the tables.
@@ -108,25 +108,30 @@ def refuse_unlike(runs: Sequence[MethodRuns]) -> None:
     label, reference = everything[0]
     for other_label, other in everything[1:]:
         between = f"{label} and {other_label}"
-        if other.protocols != reference.protocols:
-            names = sorted(
-                name
-                for name in other.protocols.keys() | reference.protocols.keys()
-                if other.protocols.get(name) != reference.protocols.get(name)
-            )
-            raise UsageError(
-                f"{between} were scored by different protocols ({', '.join(names)})",
-                field="protocols",
-                remedy="Score both with the same version of the toolkit.",
-            )
-        if other.frames != reference.frames:
-            raise UsageError(
-                f"{between} were given different training frames "
-                f"({reference.frames} and {other.frames})",
-                field="frames",
-                remedy="Compare runs with the same --train-on.",
-            )
+        refuse_other_scoring(between, reference, other)
         _same_captures(between, reference, other)
+
+
+def refuse_other_scoring(between: str, reference: Results, other: Results) -> None:
+    """Refuse results of other protocols or kinds of training frames; `between` names both."""
+    if other.protocols != reference.protocols:
+        names = sorted(
+            name
+            for name in other.protocols.keys() | reference.protocols.keys()
+            if other.protocols.get(name) != reference.protocols.get(name)
+        )
+        raise UsageError(
+            f"{between} were scored by different protocols ({', '.join(names)})",
+            field="protocols",
+            remedy="Score both with the same version of the toolkit.",
+        )
+    if other.frames != reference.frames:
+        raise UsageError(
+            f"{between} were given different training frames "
+            f"({reference.frames} and {other.frames})",
+            field="frames",
+            remedy="Compare runs with the same --train-on.",
+        )
 
 
 def _same_captures(between: str, reference: Results, other: Results) -> None:
@@ -140,24 +145,28 @@ def _same_captures(between: str, reference: Results, other: Results) -> None:
             remedy="Evaluate both on the same suite.",
         )
     for identifier, capture in ours.items():
-        twin = theirs[identifier]
-        if capture.exact_masks != twin.exact_masks:
-            problem, field = "different masks (exact and estimated)", "exact_masks"
-        elif capture.digest != twin.digest:
-            problem, field = "different data", "digest"
-        elif capture.split_digest != twin.split_digest:
-            problem, field = "different splits", "split_digest"
-        elif [f.frame for f in capture.frames] != [f.frame for f in twin.frames]:
-            problem, field = "different test frames", "frames"
-        else:
-            continue
-        raise UsageError(
-            f"{between} were evaluated on {problem} under the name {identifier}"
-            + differing_makers(capture, twin),
-            where=identifier,
-            field=field,
-            remedy="Evaluate both on the same captures with the same splits.",
-        )
+        refuse_other_frames(between, capture, theirs[identifier])
+
+
+def refuse_other_frames(between: str, capture: CaptureResult, twin: CaptureResult) -> None:
+    """Refuse results of one capture whose frames cannot be paired; `between` names both."""
+    if capture.exact_masks != twin.exact_masks:
+        problem, field = "different masks (exact and estimated)", "exact_masks"
+    elif capture.digest != twin.digest:
+        problem, field = "different data", "digest"
+    elif capture.split_digest != twin.split_digest:
+        problem, field = "different splits", "split_digest"
+    elif [f.frame for f in capture.frames] != [f.frame for f in twin.frames]:
+        problem, field = "different test frames", "frames"
+    else:
+        return
+    raise UsageError(
+        f"{between} were evaluated on {problem} under the name {capture.id}"
+        + differing_makers(capture, twin),
+        where=capture.id,
+        field=field,
+        remedy="Evaluate both on the same captures with the same splits.",
+    )
 
 
 def common_seeds(first: MethodRuns, second: MethodRuns) -> list[int]:

@@ -11,7 +11,12 @@ import numpy as np
 
 from hwp_bench.analysis.bootstrap import Estimate, bootstrap_mean
 from hwp_bench.analysis.columns import Filled, block_breaks, score_column, table_of
-from hwp_bench.analysis.pairing import group_runs, same_but_seed
+from hwp_bench.analysis.pairing import (
+    group_runs,
+    refuse_other_frames,
+    refuse_other_scoring,
+    same_but_seed,
+)
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.tables import Column, Table
 from hwp_bench.capture.schema import CaptureInfo
@@ -30,7 +35,7 @@ from hwp_bench.report.figures import (
     write_figure,
 )
 from hwp_bench.report.tables import HEADLINE, labels
-from hwp_bench.results import Results
+from hwp_bench.results import CaptureResult, Results
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -85,8 +90,9 @@ def scores_by_share(
         captures: what captures say of themselves, by digest (`report.sources.find_captures`).
 
     Raises:
-        UsageError: the share of none of these captures is known.
+        UsageError: the share of none of these captures is known, or results cannot be paired.
     """
+    _refuse_unlike(results)
     shares = {digest: clean_share_of(info) for digest, info in captures.items()}
     firsts: dict[str, Results] = {}
     curves: dict[str, dict[float, dict[str, np.ndarray]]] = {}
@@ -133,6 +139,17 @@ def scores_by_share(
         for share, values in curve.items()
     ]
     return sorted(found, key=lambda one: one.share)
+
+
+def _refuse_unlike(results: Sequence[Results]) -> None:
+    """Refuse what `compare` refuses, but that results may be of other captures."""
+    first = results[0]
+    seen: dict[str, tuple[str, CaptureResult]] = {}
+    for result in results:
+        refuse_other_scoring(f"{first.method.title} and {result.method.title}", first, result)
+        for capture in result.captures:
+            title, twin = seen.setdefault(capture.digest, (result.method.title, capture))
+            refuse_other_frames(f"{title} and {result.method.title}", twin, capture)
 
 
 def _of_its_captures(result: Results) -> Results:

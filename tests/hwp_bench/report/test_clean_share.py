@@ -67,6 +67,27 @@ def test_only_scores_of_the_same_seeds_are_paired(study) -> None:
     assert differences == [None, None, None, pytest.approx(1.0)]
 
 
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        (lambda r: replace(r, frames="clean"), "different training frames"),
+        (lambda r: replace(r, protocols={"other": {}}), "different protocols"),
+        (lambda r: _first(r, frames=r.captures[0].frames[1:]), "different test frames"),
+        (lambda r: _first(r, split_digest="9" * 64), "different splits"),
+        (lambda r: _first(r, exact_masks=not r.captures[0].exact_masks), "different masks"),
+    ],
+)
+def test_what_compare_refuses_is_refused(study, change, problem: str) -> None:
+    results, captures = study
+    results[1] = change(results[1])
+    with pytest.raises(UsageError, match=problem):
+        scores_by_share(results, captures, "psnr")
+
+
+def _first(result: Results, **changes: object) -> Results:
+    return replace(result, captures=[replace(result.captures[0], **changes)])
+
+
 def test_captures_of_no_suite_are_told_apart_by_their_digests(study) -> None:
     results, captures = study
     named = scores_by_share(results, captures, "psnr")
