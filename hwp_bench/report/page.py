@@ -15,9 +15,10 @@ from markupsafe import Markup
 from hwp_bench.analysis.compare import (
     compare,
     differences_table,
-    macro_by_seed,
+    rank_methods,
     standings,
     standings_table,
+    verdict,
 )
 from hwp_bench.analysis.cost import PLAIN, CostAnalysis, analyse_cost
 from hwp_bench.analysis.pairing import MethodRuns, group_runs, refuse_unlike
@@ -226,25 +227,13 @@ def gather_report(
 
 def summary_sentence(runs: Sequence[MethodRuns]) -> str:
     """Return what the results say, in words."""
-    facts = metric_facts(HEADLINE)
     first = runs[0].first
     frames = sum(len(capture.frames) for capture in first.captures)
-    means = {run.label: float(macro_by_seed(run, HEADLINE).mean()) for run in runs}
-    order = sorted(means, key=lambda name: -means[name])
-    best = f"{order[0]} has {means[order[0]]:.{facts.digits}f} {facts.unit}"
     where = f"On {len(first.captures)} captures ({first.suite}, {frames} test frames)"
     failed = sum(c.failed_frames for run in runs for r in run.seeds.values() for c in r.captures)
     tail = f" {failed} frames failed and count with their penalties." if failed else ""
-    if len(runs) == 1:
-        return f"{where} {best} {facts.label} (macro mean).{tail}"
-    found = compare([run for name in order[:2] for run in runs if run.label == name], HEADLINE)
-    macro = next(item for item in found if item.scope == "macro").estimate
-    text = f"{where} {best} {facts.label} (macro mean), {macro.value:+.{facts.digits}f} "
-    text += f"{facts.unit} against {order[1]}, the next"
-    if macro.low is not None and macro.high is not None:
-        text += f" (95 % interval {macro.low:+.2f} to {macro.high:+.2f}"
-        text += ")" if macro.low > 0 or macro.high < 0 else ": not significantly different)"
-    return f"{text}.{tail}"
+    told = _optional(lambda: verdict(rank_methods(runs, HEADLINE)))
+    return f"{where}: {told or 'some methods have no seed in common, so none is ranked.'}{tail}"
 
 
 def _optional(make: Callable[[], T]) -> T | None:

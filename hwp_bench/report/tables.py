@@ -30,8 +30,8 @@ from hwp_bench.taxonomy import PERTURBATIONS, perturbation
 HEADLINE = ("psnr", "ssim", "oriented_distance", "flip", "lpips_alex", "lpips_vgg")
 #: Metrics of the tables in the paper's protocol.
 PAPER = ("paper_psnr", "paper_ssim", "paper_lpips")
-#: Heading of the mean over perturbations.
-MACRO = "Macro"
+#: Heading of the mean over perturbations, and of the mean in which every frame counts the same.
+MACRO, ALL_FRAMES = "Macro", "All frames"
 
 _PAPER_NOTE = (
     "Protocol paper-wildghand: the released evaluator's settings with the data set's mask; "
@@ -54,7 +54,7 @@ def all_tables(results: Sequence[Results]) -> dict[str, Table]:
         "captures": capture_table(results, means),
         "perturbations": perturbation_table(results, means),
         "details": mean_table(results, groups, _of_protocol(HWP_V1)),
-        "micro": mean_table(results, {"All frames": [m.overall.micro for m in means]}, HEADLINE),
+        "micro": mean_table(results, {ALL_FRAMES: [m.overall.micro for m in means]}, HEADLINE),
         "paper": mean_table(results, groups, PAPER, _PAPER_NOTE),
     }
     return {name: add_isolation_note(table, results) for name, table in tables.items()}
@@ -93,7 +93,10 @@ def mean_table(
         for title, means in groups.items()
         for name in names
     ]
-    scope = f"Every mean is over captures of means over test frames; {_scope(results)}."
+    what = "over captures of means over test frames"
+    if ALL_FRAMES in groups:
+        what = "over all test frames, each of which counts the same"
+    scope = f"Every mean is {what}; {_scope(results)}."
     if MACRO in groups:
         scope += " Macro: the mean over perturbations, each over the captures with it."
     notes = tuple(text for text in (note, scope, makers_note(results)) if text)

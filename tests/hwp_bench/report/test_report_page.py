@@ -15,6 +15,7 @@ from browser import DESK, PHONE, least_contrast, open_page, overflow, show
 from made_entries import complete_results
 from made_results import made_results
 
+from hwp_bench.analysis.compare import rank_methods, verdict
 from hwp_bench.analysis.pairing import group_runs
 from hwp_bench.base.errors import HwpError, UsageError
 from hwp_bench.base.files import write_json
@@ -159,7 +160,8 @@ def test_everything_that_was_asked_for_is_there(page: str) -> None:
 def test_the_first_sentence_says_what_the_numbers_say(sources) -> None:
     runs = group_runs([source.results for source in sources[0]])
     sentence = summary_sentence(runs)
-    assert "has 23.50 dB PSNR (macro mean), +3.00 dB against Plain" in sentence
+    assert "with PSNR 23.50 dB (macro mean): +3.00 dB against Plain" in sentence
+    assert verdict(rank_methods(runs, "psnr")) in sentence
     assert "failed" not in sentence
 
 

@@ -75,6 +75,8 @@ def test_means_are_what_they_are_by_hand(two) -> None:
     assert per.rows[1][1] == pytest.approx(27)
     assert per.rows[1][3] == pytest.approx(17)
     assert tables["paper"].rows[0][1] == pytest.approx(1.0)
+    assert "over all test frames, each of which counts the same" in tables["micro"].notes[0]
+    assert "over captures of means over test frames" in tables["overall"].notes[0]
     assert tables["micro"].rows[0][1] == pytest.approx((20 + 22 + 10 + 12 + 40 + 42) / 6)
     assert [row[2] for row in tables["captures"].rows] == ["Plain", "Better"] * 3
 
