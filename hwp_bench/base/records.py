@@ -298,6 +298,14 @@ Line = Annotated[
         description="one line of at most 1,000 characters",
     ),
 ]
+#: A moment, ISO 8601 in UTC.
+Moment = Annotated[
+    str,
+    Meta(
+        pattern=r"\A\d{4}-\d{2}-\d{2}T\d{2}:\d{2}:\d{2}\+00:00\Z",
+        description="a moment such as 2026-01-01T00:00:00+00:00",
+    ),
+]
 #: A text that is not empty, of at most 10,000 characters.
 Text = Annotated[str, Meta(min_length=1, max_length=MAX_TEXT)]
 #: A text that may be empty or have several lines, such as the reason of a failure.

@@ -14,7 +14,7 @@ from msgspec import Meta
 from hwp_bench.base.errors import BadResult, HwpError, UsageError
 from hwp_bench.base.files import atomic_write, read_json, sha256_json
 from hwp_bench.base.packages import PACKAGES
-from hwp_bench.base.records import Count, Digest, Line, number, parse_record, without_schema
+from hwp_bench.base.records import Count, Digest, Line, Moment, number, parse_record, without_schema
 from hwp_bench.results import Results
 from hwp_bench.results.schema import MAX_CAPTURES, ScoreTable, check_scores
 
@@ -39,14 +39,6 @@ BADGES = {
 LINKS = ("code", "paper", "predictions", "avatars")
 
 T = TypeVar("T")
-#: A moment, ISO 8601 in UTC.
-Moment = Annotated[
-    str,
-    Meta(
-        pattern=r"\A\d{4}-\d{2}-\d{2}T\d{2}:\d{2}:\d{2}\+00:00\Z",
-        description="a moment such as 2026-01-01T00:00:00+00:00",
-    ),
-]
 
 
 @dataclass(frozen=True)

@@ -267,8 +267,19 @@ def check_unchanged(folder: Path, base: Path) -> int:
 SCHEMA = "hwp-leaderboard-names/1"
 #: Its name, next to the folder of entries.
 NAME = "names.json"
-# Signs that look like others.
+# Signs that look like others, and Greek and Cyrillic letters that look like Latin ones: capitals
+# before the case is folded, since a capital nu looks like an N and a small one like a v.
 _ALIKE = str.maketrans({"0": "o", "1": "l", "i": "l", "|": "l", "5": "s"})
+_CAPITALS = str.maketrans(
+    "\u0391\u0392\u0395\u0396\u0397\u0399\u039a\u039c\u039d\u039f\u03a1\u03a4\u03a5\u03a7"
+    "\u0410\u0412\u0415\u041a\u041c\u041d\u041e\u0420\u0421\u0422\u0425\u0405\u0406\u0408",
+    "ABEZHIKMNOPTYXABEKMHOPCTXSIJ",
+)
+_SMALL = str.maketrans(
+    "\u03b1\u03b9\u03ba\u03bd\u03bf\u03c1\u03c5\u0251\u0261\u0131"
+    "\u0430\u0435\u043e\u0440\u0441\u0443\u0445\u0455\u0456\u0458\u04bb\u0501\u051b\u051d\u0578",
+    "aikvopuagiaeopcyxsijhdqwn",
+)
 
 
 @dataclass(frozen=True)
@@ -364,7 +375,7 @@ def _taken(entry: Entry) -> str | None:
 
 def _look(text: str) -> str:
     """Return a text as it looks at a glance: without case, accents, spaces and signs."""
-    plain = unicodedata.normalize("NFKD", text).casefold()
+    plain = unicodedata.normalize("NFKD", text).translate(_CAPITALS).casefold().translate(_SMALL)
     return "".join(c for c in plain if c.isalnum()).translate(_ALIKE)
 
 
@@ -450,9 +461,7 @@ def check_contest(entry: Entry, contest: Contest) -> None:
 def check_dates(entry: Entry, now: datetime | None = None) -> None:
     """Refuse an entry or a check of it that is dated after now, or a check before its entry."""
     latest = (now or datetime.now(UTC)) + _SKEW
-    started = datetime.fromisoformat(entry.results.started)
-    if started.tzinfo is None:
-        started = started.replace(tzinfo=UTC)
+    started = _moment(entry, "started", entry.results.started)
     if started > latest:
         raise _wrong(entry, "started", f"is {entry.results.started}, which is not yet")
     for check in entry.additions:
@@ -460,7 +469,7 @@ def check_dates(entry: Entry, now: datetime | None = None) -> None:
 
 
 def _check_date(entry: Entry, check: Check | Contest, started: datetime, latest: datetime) -> None:
-    date = datetime.fromisoformat(check.date)
+    date = _moment(entry, f"checks, {check.kind} {check.digest[:8]}", check.date)
     if date > latest or date < started:
         problem = "is not yet" if date > latest else f"is before {entry.results.started}, its run"
         raise BadResult(
@@ -469,6 +478,14 @@ def _check_date(entry: Entry, check: Check | Contest, started: datetime, latest:
             field=f"checks, {check.kind} {check.digest[:8]}",
             remedy="Look at the clock of the machine, and make the file again.",
         )
+
+
+def _moment(entry: Entry, field: str, text: str) -> datetime:
+    """Read a moment; its form is right, but there may be no such day."""
+    try:
+        return datetime.fromisoformat(text)
+    except ValueError as error:
+        raise _wrong(entry, field, f"is {text}, which is not a moment") from error
 
 
 def _check_overruling(entry: Entry, check: Check) -> None:

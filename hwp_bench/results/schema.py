@@ -21,7 +21,7 @@ from msgspec import Meta
 from hwp_bench.base import packages
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import canonical_json, files_digest
-from hwp_bench.base.records import Count, Digest, Line, Message, Seconds, Seed
+from hwp_bench.base.records import Count, Digest, Line, Message, Moment, Seconds, Seed
 from hwp_bench.base.tables import Table
 from hwp_bench.metrics import METRICS
 from hwp_bench.metrics.score import CaptureScores, Scores, aggregate
@@ -262,7 +262,7 @@ class Results:
     #: Versions, processor, system.
     environment: FreeTable
     #: When the evaluation started, ISO 8601, UTC.
-    started: Line
+    started: Moment
     captures: Annotated[list[CaptureResult], Meta(max_length=MAX_CAPTURES)]
     toolkit: Line
 

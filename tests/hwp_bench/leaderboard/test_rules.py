@@ -359,6 +359,16 @@ def test_false_dates_are_refused(started: str, checked: str | None, problem: str
     check_dates(make_entry(complete_results("mine")))
 
 
+def test_an_entry_of_no_day_is_left_out_alone(tmp_path: Path, capsys) -> None:
+    add_entries(tmp_path, [complete_results("mine")])
+    for name, started in (("other", "2026-02-30T00:00:00+00:00"), ("third", "yesterday")):
+        write_entry(tmp_path, make_entry(replace(complete_results(name), started=started)))
+    assert [entry.results.method.name for entry in sound_entries(tmp_path)] == ["mine"]
+    said = capsys.readouterr().err
+    assert "is 2026-02-30T00:00:00+00:00, which is not a moment" in said
+    assert "started: is 'yesterday', expected a moment such as" in said
+
+
 def test_a_false_check_is_left_out_and_takes_no_row_away(tmp_path: Path, capsys) -> None:
     (file,) = add_entries(tmp_path, [complete_results("mine")])
     (entry,) = read_entries(tmp_path)
@@ -378,7 +388,8 @@ def test_a_false_check_is_left_out_and_takes_no_row_away(tmp_path: Path, capsys)
 @pytest.mark.parametrize(
     ("name", "title"),
     [("wildghand", "Mine"), ("mine", "WildGHand"), ("mine", "WiIdGHand"), ("Plain", "P"),
-     ("mine", "Wild G-Hand"), ("mine", "PLAIN FIT"), ("w1ldghand", "Mine")],
+     ("mine", "Wild G-Hand"), ("mine", "PLAIN FIT"), ("w1ldghand", "Mine"),
+     ("mine", "WildGH\u0430nd"), ("mine", "\u0420lain fit"), ("mine", "WildGHa\u039dd")],
 )  # fmt: skip
 def test_the_name_of_a_method_that_ships_is_nobody_elses(
     tmp_path: Path, name: str, title: str
