@@ -108,7 +108,8 @@ def _recipe(args: argparse.Namespace) -> SealedRecipe:
         if args.frame_count is not None or args.size is not None:
             raise UsageError("has its own frames and size", field="--suite")
         return suite_recipe(args.suite)
-    return recipe_of(args.scenes, args.frame_count or 60, args.size or 176)
+    frames = 60 if args.frame_count is None else args.frame_count
+    return recipe_of(args.scenes, frames, 176 if args.size is None else args.size)
 
 
 def _add_reveal(parser: argparse.ArgumentParser) -> None:

@@ -224,8 +224,10 @@ def _submission(args: argparse.Namespace) -> Submission:
     return Submission(args.author, args.revises, args.reason, links)
 
 
-def _check_line(option: str, text: str) -> None:
+def _check_line(option: str, text: str, *, empty: bool = True) -> None:
     """Refuse what an entry cannot hold: it would be written, and then not be read."""
+    if not empty and not text:
+        raise UsageError("is empty", field=option)
     if len(text) > _LINE or "\n" in text or has_odd_characters(text):
         raise UsageError(
             f"{shown(text[:60])!r} is not one line of at most {_LINE:,} characters without "
@@ -282,6 +284,7 @@ def _confirm(args: argparse.Namespace, folder: Path) -> int:
     from hwp_bench.results import read_results, results_among
 
     _check_line("--checked-by", args.checked_by)
+    _check_line("--reason", args.reason)
     refuse_installed(folder)
     _refuse_none(folder)
     if not 0 <= args.tolerance <= 100:
@@ -323,8 +326,8 @@ def _contest(args: argparse.Namespace, folder: Path) -> int:
     from hwp_bench.leaderboard.submit import contest
     from hwp_bench.results import result_files
 
-    _check_line("--checked-by", args.checked_by)
-    _check_line("--reason", args.reason)
+    _check_line("--checked-by", args.checked_by, empty=False)
+    _check_line("--reason", args.reason, empty=False)
     refuse_installed(folder)
     _refuse_none(folder)
     fitting = [entry for entry in sound_entries(folder) if entry.name == args.entry]
@@ -332,7 +335,11 @@ def _contest(args: argparse.Namespace, folder: Path) -> int:
         raise UsageError("is not a sound entry", where=folder, field=args.entry)
     rerun: Path | str = args.rerun
     if not args.withdraw:
-        (rerun,) = result_files(args.rerun)
+        files = result_files(args.rerun)
+        if len(files) != 1:
+            problem = f"has {len(files)} results, and one run contests one entry"
+            raise UsageError(problem, where=args.rerun, field="RERUN")
+        (rerun,) = files
         check_source(rerun)
     made = contest(
         fitting[0], rerun, by=args.checked_by, reason=args.reason, withdraws=args.withdraw

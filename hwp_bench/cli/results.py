@@ -84,14 +84,14 @@ def _add_table(parser: argparse.ArgumentParser) -> None:
 def _table(args: argparse.Namespace) -> int:
     from hwp_bench.report.requested_table import TableRequest, make_table
 
+    if args.figure is not None and args.by != "clean-share":
+        problem = f"there is none of the table {args.by!r}"
+        raise UsageError(problem, field="--figure", remedy="Give --by clean-share.")
     request = TableRequest(
         args.results, args.by, args.paper, args.published, args.baseline, args.capture
     )
     _print_table(make_table(request), "json" if args.json else args.format)
     if args.figure is not None:
-        if args.by != "clean-share":
-            problem = f"there is none of the table {args.by!r}"
-            raise UsageError(problem, field="--figure", remedy="Give --by clean-share.")
         from hwp_bench.report.clean_share import write_clean_share
         from hwp_bench.report.sources import find_captures
         from hwp_bench.results import read_all

@@ -153,6 +153,23 @@ def test_only_a_whole_second_run_of_the_same_method_contests(
     assert not (folder / "contests").exists()
 
 
+@pytest.mark.parametrize("option", ["--reason", "--checked-by"])
+@pytest.mark.parametrize("text", ["", "a\nb"])
+def test_what_a_contest_cannot_hold_is_refused(
+    folder: Path, tmp_path: Path, option: str, text: str
+) -> None:
+    assert call(folder, tmp_path / "at20", option, text) == 2
+    assert not (folder / "contests").exists()
+
+
+def test_one_run_contests(folder: Path, tmp_path: Path, capsys) -> None:
+    for seed in (0, 1):
+        results = with_keys(replace(run(20.0), seed=seed))
+        write_results(tmp_path / "both" / f"seed-{seed}" / "results.json", results)
+    assert call(folder, tmp_path / "both") == 2
+    assert "has 2 results" in capsys.readouterr().err
+
+
 def test_unsound_runs_and_edited_files_are_refused(folder: Path, tmp_path: Path) -> None:
     entry = own(folder)
     unsound = replace(run(20.0), captures=[replace(c, key="k") for c in run(20.0).captures])
