@@ -19,7 +19,7 @@ from typing import Any
 
 from hwp_bench.analysis.bootstrap import Estimate
 from hwp_bench.analysis.columns import Filled, score_column, table_of
-from hwp_bench.analysis.compare import contrasts
+from hwp_bench.analysis.compare import ALPHA, contrasts, holm
 from hwp_bench.analysis.pairing import MACRO, MethodRuns
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import atomic_write, read_json, sha256_json
@@ -195,19 +195,20 @@ def against_each(one: Field) -> str:
 
     That it is ahead of all of them needs each pair to tell, at 5 % without an allowance for
     their number: an intersection-union test (Berger, Multiparameter hypothesis testing and
-    acceptance sampling, 1982).
+    acceptance sampling, 1982). How many it is ahead of, where not of all, is Holm's.
     """
     pairs = [(row.title, one.leads[row.name]) for row in one.others if row.name in one.leads]
     told = [(title, lead) for title, lead in pairs if lead.p is not None]
     if not told:
         return ""
-    ahead, behind = (
-        [title for title, lead in told if verdict_of(lead) == what] for what in ("ahead", "behind")
-    )
     ours, others = "WildGHand, named before the runs, is significantly ahead of", len(one.others)
-    if len(ahead) < others:
-        beaten_by = ", ".join(behind) or "none"
-        return f"{ours} {len(ahead)} of the {others} others, and behind {beaten_by}."
+    if sum(verdict_of(lead) == "ahead" for _, lead in told) < others:
+        adjusted = holm([lead.p or 0.0 for _, lead in told])
+        differing = [pair for pair, p in zip(told, adjusted, strict=True) if p < ALPHA]
+        ahead = sum(lead.value > 0 for _, lead in differing)
+        beaten_by = ", ".join(title for title, lead in differing if lead.value < 0) or "none"
+        allowed = f" (Holm over the {len(told)} pairs)" if told[1:] else ""
+        return f"{ours} {ahead} of the {others} others, and behind {beaten_by}{allowed}."
     if others == 1:
         return f"{ours} the other: {signed(told[0][1])} dB."
     title, lead = max(told, key=lambda pair: pair[1].p or 0.0)
@@ -244,7 +245,7 @@ def _field_table(one: Field) -> Table:
         head = Column(f"PSNR: {perturbation(name).title}", 2, higher_is_better=True)
         columns.append((head, [row.scopes.get(name, {}).get(METRIC) for row in rows]))
     columns += [
-        (Column("PSNR: novel views", 2, True), [_novel_views(row) for row in rows]),
+        (Column("PSNR: novel views", 2, True), _novel_views(rows)),
         (Column("Fit [s]", 1), [row.fit_seconds for row in rows]),
         (Column("Seeds", 0), [len(row.seeds) for row in rows]),
         (Column("Complete"), ["yes" if row.whole else "no" for row in rows]),
@@ -256,11 +257,18 @@ def _field_table(one: Field) -> Table:
     )
 
 
-def _novel_views(row: BoardRow) -> float | None:
-    """Mean over captures of the mean over a free-view clip; None where there is none."""
-    clips = [capture.free_view.frames for capture in row.captures if capture.free_view]
-    means = [fmean(frame.scores[METRIC] for frame in clip) for clip in clips]
-    return fmean(means) if means else None
+def _novel_views(rows: Sequence[BoardRow]) -> list[float | None]:
+    """Mean over captures of the mean over a free-view clip, of each row.
+
+    None where a row lacks a clip that another one has: its mean would be of other captures.
+    """
+    filmed = {c.id for row in rows for c in row.captures if c.free_view is not None}
+    means: list[float | None] = []
+    for row in rows:
+        clips = [c.free_view for c in row.captures if c.id in filmed]
+        found = [fmean(frame.scores[METRIC] for frame in clip.frames) for clip in clips if clip]
+        means.append(fmean(found) if found and len(found) == len(clips) else None)
+    return means
 
 
 def _facts(rows: Sequence[BoardRow]) -> str:

@@ -6,6 +6,7 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from made_entries import complete_results
@@ -17,6 +18,7 @@ from hwp_bench.cli.main import main
 from hwp_bench.leaderboard.pages import (
     PICTURES,
     Sources,
+    _novel_views,
     against_each,
     find_faults,
     verdict_of,
@@ -129,7 +131,8 @@ def test_the_field_has_the_means_and_differences_of_the_entries(checkout: Path) 
     assert cells(page, "Plain")[3].startswith(f"{lead:+.2f} (")
     assert cells(page, "Trimmed")[4] == "ahead"
     assert "The end.\n" in page
-    assert "significantly ahead of 1 of the 2 others, and behind none." in page
+    holm = "(Holm over the 2 pairs)"
+    assert f"significantly ahead of 1 of the 2 others, and behind none {holm}." in page
     assert "3 of the 15 methods that ship are complete here" in page
     assert "**Incomplete**: no complete run of " in page
     # 28.5 dB against 30.2 on the last capture; one dB ahead elsewhere.
@@ -153,6 +156,35 @@ def test_a_method_ahead_of_each_other_one_is_said_to_be(tmp_path: Path) -> None:
     assert re.search(
         rf"ahead of all 2 others; least surely of {found}: \+3\.\d\d \(", against_each(one)
     )
+
+
+def test_how_many_others_are_behind_allows_for_their_number() -> None:
+    """Oracle: Holm by hand. 0.02 of one pair is significant, and of two pairs it is 0.04."""
+
+    def said(*p_values: float) -> str:
+        rows = [SimpleNamespace(name=f"m{k}", title=f"M{k}") for k in range(len(p_values))]
+        leads = {
+            f"m{k}": Estimate(value, value - 1.0, value + 1.0, 0.9, p, detectable=1.0, captures=8)
+            for k, (p, value) in enumerate(zip(p_values, (-2.0, 2.0, 2.0), strict=False))
+        }
+        return against_each(SimpleNamespace(others=rows, leads=leads))
+
+    assert "ahead of 0 of the 3 others, and behind none (Holm over the 3" in said(0.02, 0.03, 0.04)
+    assert "ahead of 1 of the 3 others, and behind M0 (Holm" in said(0.02, 0.01, 0.30)
+    assert "ahead of 0 of the 1 others, and behind M0." in said(0.02)
+
+
+def test_novel_views_are_compared_over_the_same_clips() -> None:
+    def row(*scores: float | None) -> SimpleNamespace:
+        captures = []
+        for number, score in enumerate(scores):
+            clip = SimpleNamespace(frames=[SimpleNamespace(scores={"psnr": score})])
+            captures.append(SimpleNamespace(id=f"c{number}", free_view=clip if score else None))
+        return SimpleNamespace(captures=captures)
+
+    rows = [row(20.0, 30.0, None), row(None, 40.0, None), row(None, None, None)]
+    assert _novel_views(rows) == [25.0, None, None]
+    assert _novel_views(rows[2:]) == [None]
 
 
 def test_a_suite_has_a_picture_that_the_page_shows(checkout: Path) -> None:
