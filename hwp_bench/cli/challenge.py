@@ -47,10 +47,10 @@ _CHECK = """examples:
   hwp-bench challenge check public revealed.json --capture sealed-capture0   # one of them
   hwp-bench challenge check public revealed.json --no-render                 # the commitments alone
 
-Renders every capture again from the secret, in the folder of --work, and compares training frames
-and the commitments to test frames. Exit status 0: all is as committed to; 1: the secret is another
-one, or a capture differs (on another kind of machine the simulator may round otherwise: --json says
-by how many levels).
+Renders every capture again from the secret, in the folder of --work, and compares training frames,
+hand parameters, cameras, split and the commitments to test frames. Exit status 0: all is as
+committed to; 1: the secret is another one, or a capture differs (on another kind of machine the
+simulator may round otherwise: --json says by how many levels).
 """
 
 
@@ -161,6 +161,8 @@ def _check(args: argparse.Namespace) -> int:
                 f"differs: test frames {hidden}, {capture.different} training images "
                 f"differ by at most {capture.levels} of 255"
             )
+            if not capture.numbers:
+                text += ", hand parameters, cameras or the split differ"
         print(f"{capture.id}: {text}")
     return status
 

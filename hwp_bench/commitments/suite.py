@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import secrets
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -20,7 +20,8 @@ from hwp_bench.base.folders import exclusive
 from hwp_bench.base.packages import __version__
 from hwp_bench.base.records import Digest, Line
 from hwp_bench.capture import Capture, open_capture
-from hwp_bench.capture.splits import split_for
+from hwp_bench.capture.schema import Cameras
+from hwp_bench.capture.splits import Split, split_for
 from hwp_bench.commitments.publication import (
     PUBLIC,
     SEALED,
@@ -40,6 +41,8 @@ from hwp_bench.commitments.recipe import (
     secret_commitment,
     write_secret,
 )
+from hwp_bench.hands import HandParameters
+from hwp_bench.methods.contract import TrainingCapture
 from hwp_bench.methods.request import open_request
 from hwp_bench.run.engine import Engine, Needs
 from hwp_bench.sim.produce.capture import ensure_suite
@@ -51,6 +54,8 @@ REVEAL_SCHEMA = "hwp-revealed/1"
 #: Names inside the folder of a sealed suite. The keeper's part holds the secret and the captures,
 #: the publication the part for authors and the sealed part that scores them.
 KEEPER, SECRET, CAPTURES, PUBLICATION = "keeper", "secret.json", "captures", "publication"
+#: By how much hand parameters and cameras may differ: another machine may round otherwise.
+_ROUNDING = 1e-5
 #: The page, inside the part for authors.
 SUITE = "suite.json"
 
@@ -199,13 +204,15 @@ class CheckedCapture:
     hidden: bool
     #: Training and validation frames of the public part that differ from the new ones.
     different: int
-    #: Largest difference of these frames, levels of 255.
+    #: Largest difference of these frames, levels of 255; 255 where their sizes differ.
     levels: int
+    #: Whether hand parameters, cameras and the split of the public part are the new ones.
+    numbers: bool
 
     @property
     def same(self) -> bool:
         """Whether nothing differs."""
-        return self.hidden and not self.different
+        return self.hidden and not self.different and self.numbers
 
 
 @dataclass(frozen=True)
@@ -276,7 +283,31 @@ def _compare(public: Path, capture: Capture, committed: str, salt: str) -> Check
             (capture.frame(frame), given.frame(frame)),
             (capture.mask(frame), given.mask(frame)),
         ):
-            gap = int(np.abs(ours.astype(int) - theirs.astype(int)).max())
+            gap = 255
+            if ours.shape == theirs.shape:
+                gap = int(np.abs(ours.astype(int) - theirs.astype(int)).max())
             different += gap > 0
             levels = max(levels, gap)
-    return CheckedCapture(name, hidden, different, levels)
+    return CheckedCapture(name, hidden, different, levels, _same_numbers(capture, split, given))
+
+
+def _same_numbers(capture: Capture, split: Split, given: TrainingCapture) -> bool:
+    """Whether hands, cameras and split of a capture are those of the public part."""
+    ours, theirs = [_numbers(one.hands, one.cameras) for one in (capture, given)]
+    clip, views = capture.free_view, given.free_views
+    if (clip is None) != (views is None) or split != given.split:
+        return False
+    if clip is not None and views is not None:
+        ours += _numbers(clip.hands, clip.cameras)
+        theirs += _numbers(views.hands, views.cameras)
+    return len(ours) == len(theirs) and all(
+        one.shape == other.shape and np.allclose(one, other, rtol=0, atol=_ROUNDING)
+        for one, other in zip(ours, theirs, strict=True)
+    )
+
+
+def _numbers(hands: Mapping[str, HandParameters], cameras: Cameras) -> list[np.ndarray]:
+    arrays = [cameras.Ks, cameras.viewmats]
+    for _, hand in sorted(hands.items()):
+        arrays += [hand.pose, hand.betas, hand.transl, hand.valid]
+    return arrays

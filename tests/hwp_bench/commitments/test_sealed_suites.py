@@ -13,7 +13,7 @@ import pytest
 from small_methods import write_submission
 
 from hwp_bench.base.errors import BadInput, HwpError, UsageError
-from hwp_bench.base.images import read_rgb, write_image
+from hwp_bench.base.images import read_gray, read_rgb, write_image
 from hwp_bench.capture import open_capture
 from hwp_bench.capture.schema import frame_name
 from hwp_bench.cli.main import main
@@ -205,6 +205,33 @@ def test_frames_that_do_not_follow_from_the_secret_are_found_out(
     assert "others than committed to, 1 training images differ by at most 3" in (
         capsys.readouterr().out
     )
+
+
+@pytest.mark.parametrize("change", ["hands", "cameras", "size"])
+def test_other_numbers_and_sizes_are_found_out(
+    change: str, suite: Path, revealed: Path, tmp_path: Path, capsys
+) -> None:
+    """Hand parameters a degree off, cameras a pixel off, or images and record of another size."""
+    public = suite / "publication" / "public" / NAME
+    if change == "size":
+        record = json.loads((public / "request.json").read_text())
+        record["width"] *= 2
+        (public / "request.json").write_text(json.dumps(record))
+        for image in [*public.glob("frames/*.png"), *public.glob("masks/*.png")]:
+            pixels = read_rgb(image) if image.parent.name == "frames" else read_gray(image)
+            write_image(image, np.repeat(pixels, 2, axis=1))
+    else:
+        file = public / f"{change}.npz"
+        arrays = dict(np.load(file))
+        name = next(key for key in arrays if "pose" in key or key == "Ks")
+        off = np.array([[0, 0, 1], [0, 0, 0], [0, 0, 0]]) if change == "cameras" else 0.02
+        arrays[name] = (arrays[name] + off).astype(arrays[name].dtype)
+        np.savez(file, **arrays)
+    capsys.readouterr()
+    assert checked(suite, revealed, tmp_path / "work") == 1
+    said = capsys.readouterr().out
+    wanted = "differ by at most 255 of 255" if change == "size" else "cameras or the split differ"
+    assert wanted in said
 
 
 @pytest.mark.parametrize("place", ["keeper/secret.json", "publication/public/suite.json"])
