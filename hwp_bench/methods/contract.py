@@ -50,7 +50,8 @@ class Method(Protocol):
     """A way to make an avatar from a training capture.
 
     The entry of `method.toml` names a callable that takes `settings` (the preset's table, with
-    the overrides of the command line) and `seed`, and returns an object with this method.
+    the overrides of the command line; `light.degree` is in the table `light`) and `seed`, and
+    returns an object with this method.
     """
 
     def fit(self, training: TrainingCapture, budget: Budget, report: Report) -> Avatar:

@@ -153,6 +153,21 @@ def test_a_table_that_is_given_in_part_keeps_the_rest(
     assert results.method.settings == {"gray": 0.5, "light": {"degree": 2, "rate": 0.2}}
 
 
+def test_dotted_names_reach_a_method_as_tables(
+    gray_method: Path, make_capture: CaptureMaker, tmp_path: Path
+) -> None:
+    # Oracle: the table that a reader of TOML makes of the same names.
+    manifest, source = gray_method / "method.toml", gray_method / "gray_method.py"
+    manifest.write_text(manifest.read_text() + "light.degree = 2\nlight.rate = 0.1\n")
+    expected = {"gray": 0.5, "light": {"degree": 0, "rate": 0.1}}
+    line = f"        assert settings == {expected}, settings\n"
+    source.write_text(METHOD.replace("        self.gray", line + "        self.gray"))
+    # It is made twice: before the first capture, and to fit it.
+    capture, changes = make_capture(frames=20, size=48), {"light.degree": 0}
+    results = hwp_bench.evaluate(gray_method, capture, tmp_path / "out", settings=changes)
+    assert results.captures[0].failure is None
+
+
 def test_score_takes_float_images(make_capture: CaptureMaker) -> None:
     capture = make_capture(frames=20, size=48)
     image, mask = capture.frame(0), capture.mask(0)
