@@ -24,6 +24,7 @@ from hwp_bench.evaluation.scoring import (
     colour_warnings,
     mean_scores,
     read_prediction,
+    read_scorable,
     read_targets,
     score_frames_of,
 )
@@ -246,10 +247,11 @@ def _confinement(evaluation: CaptureEvaluation, output: Path) -> Confinement:
 def _curve(evaluation: CaptureEvaluation, output: Path, facts: RunFacts) -> list[CurvePoint]:
     validation = set(evaluation.split.validation.tolist())
     frames = [frame for frame in dict.fromkeys(facts.checkpoint_frames) if frame in validation]
-    if not frames:
-        return []
-    targets = read_targets(evaluation.capture, frames)
-    curve = []
+    # A validation frame without a hand has no score, which must not cost a whole fit.
+    targets = read_scorable(evaluation.capture, frames)
+    curve: list[CurvePoint] = []
+    if not targets:
+        return curve
     for index, checkpoint in enumerate(facts.checkpoints):
         drawn = score_frames_of(targets, checkpoint_folder(output, index), evaluation.capture.size)
         curve.append(CurvePoint(**asdict(checkpoint), scores=mean_scores(drawn.scores)))
