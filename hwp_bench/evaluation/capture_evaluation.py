@@ -22,7 +22,6 @@ from hwp_bench.evaluation.artifacts import keep_artifacts
 from hwp_bench.evaluation.scoring import (
     WARNINGS,
     colour_warnings,
-    mean_scores,
     read_prediction,
     read_scorable,
     read_targets,
@@ -34,7 +33,7 @@ from hwp_bench.methods.manifest import MethodManifest, read_manifest, ships
 from hwp_bench.methods.request import write_request
 from hwp_bench.metrics import METRICS, PROTOCOLS
 from hwp_bench.metrics.lpips import load_available
-from hwp_bench.metrics.score import Network
+from hwp_bench.metrics.score import Network, mean_scores
 from hwp_bench.results import CaptureResult, CurvePoint, FreeViewResult, Results
 from hwp_bench.results.schema import ISOLATED
 from hwp_bench.run.engine import Folder, Job, Needs
@@ -254,7 +253,8 @@ def _curve(evaluation: CaptureEvaluation, output: Path, facts: RunFacts) -> list
         return curve
     for index, checkpoint in enumerate(facts.checkpoints):
         drawn = score_frames_of(targets, checkpoint_folder(output, index), evaluation.capture.size)
-        curve.append(CurvePoint(**asdict(checkpoint), scores=mean_scores(drawn.scores)))
+        scores = mean_scores(frame.scores for frame in drawn.scores)
+        curve.append(CurvePoint(**asdict(checkpoint), scores=scores))
     return curve
 
 

@@ -167,13 +167,6 @@ def score_predictions(
     ]
 
 
-def mean_scores(frames: Sequence[FrameResult]) -> dict[str, float]:
-    """Return the mean of every metric over frames."""
-    return {
-        name: float(np.mean([frame.scores[name] for frame in frames])) for name in frames[0].scores
-    }
-
-
 def predictions_digest(predictions: Sequence[Prediction]) -> str:
     """Return the SHA-256 (hex) over the decoded pixels of predictions, in order.
 
