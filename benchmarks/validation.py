@@ -33,10 +33,11 @@ from hwp_bench.capture import open_capture
 from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.cli.options import overrides
 from hwp_bench.evaluation.evaluate import make_budget
-from hwp_bench.evaluation.scoring import Prediction, mean_scores, read_targets, score_predictions
+from hwp_bench.evaluation.scoring import Prediction, read_targets, score_predictions
 from hwp_bench.methods import find_method, read_manifest
 from hwp_bench.methods.contract import Avatar, Budget, RunSettings
 from hwp_bench.methods.request import open_request, write_request
+from hwp_bench.metrics.score import mean_scores
 from hwp_bench.run.worker import load_entry, render_checked
 from hwp_bench.sim.produce.capture import ensure_suite, suite
 
@@ -111,7 +112,8 @@ def score_fit(
             hands, camera = training.hand_poses(frame), training.camera(frame)
             image = render_checked(avatar, hands, camera, f"frame {frame}")
             made.append(Prediction(frame, image, None))
-    return mean_scores(score_predictions(read_targets(opened, frames), made))["psnr"]
+    scored = score_predictions(read_targets(opened, frames), made)
+    return mean_scores(frame.scores for frame in scored)["psnr"]
 
 
 def main() -> None:

@@ -5,6 +5,7 @@ Each does what the command of its name does.
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
@@ -31,7 +32,8 @@ from hwp_bench.evaluation.sentences import outcome_lines
 from hwp_bench.methods.contract import MethodFactory, RunSettings
 from hwp_bench.methods.manifest import find_method, read_manifest
 from hwp_bench.methods.source import write_method
-from hwp_bench.metrics.score import score_frame
+from hwp_bench.metrics.lpips import load_available
+from hwp_bench.metrics.score import Network, score_frame
 from hwp_bench.report.tables import HEADLINE
 from hwp_bench.results import Results, read_all
 from hwp_bench.run.engine import Engine, LocalEngine
@@ -160,17 +162,25 @@ def score(
         exact: the mask is exact coverage, not an estimate (`Capture.scoring_mask` says so).
 
     Returns:
-        Score by metric; `hwp_bench.metrics.METRICS` says what each means.
+        Score by metric; `hwp_bench.metrics.METRICS` says what each means. LPIPS and FLIP are there
+        where `evaluate` computes them: where their weights or package are.
 
     Raises:
         ShapeMismatch: the three do not describe one image.
-        BadInput: a pixel is NaN or out of range, or the mask leaves nothing to score.
+        BadInput: a pixel is NaN or out of range.
+        EmptyMask: the mask leaves nothing to score.
         UsageError: one of them is not an array.
     """
     given = {"prediction": prediction, "target": target, "mask": mask}
     for name, image in given.items():
         of_type(image, np.ndarray, name, "a NumPy array")
-    return score_frame(prediction, target, mask, coverage=exact)
+    return score_frame(prediction, target, mask, coverage=exact, networks=_networks())
+
+
+@functools.cache
+def _networks() -> Mapping[str, Network]:
+    """LPIPS and FLIP, read once: a loop over frames must not wait for weights at each."""
+    return load_available()
 
 
 def compare(

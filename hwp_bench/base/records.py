@@ -397,14 +397,16 @@ def without_schema(
 def unfold(values: Mapping[str, Any]) -> dict[str, Any]:
     """Turn dotted names into tables: `{"a.b": 1}` means `{"a": {"b": 1}}`.
 
-    Tables that are named twice are merged; later entries win.
+    Tables that are named twice are merged; later entries win. One name makes at most `MAX_DEPTH`
+    tables.
     """
     tree: dict[str, Any] = {}
     for name, value in values.items():
-        head, dot, rest = str(name).partition(".")
-        if dot:
-            value = {rest: value}
-        tree = merged(tree, {head: unfold(value) if isinstance(value, Mapping) else value})
+        *tables, last = str(name).split(".", MAX_DEPTH)
+        branch: dict[str, Any] = {last: unfold(value) if isinstance(value, Mapping) else value}
+        for table in reversed(tables):
+            branch = {table: branch}
+        tree = merged(tree, branch)
     return tree
 
 

@@ -300,7 +300,8 @@ def _evaluation_settings(args: argparse.Namespace) -> EvaluationSettings:
         confinement=Confinement(
             mode=args.isolation,
             memory_limit=None if args.memory_limit is None else int(args.memory_limit * 1e9),
-            exposed=tuple(Path(path) for path in args.expose),
+            # A machine of a cluster has another working folder.
+            exposed=tuple(Path(path).absolute() for path in args.expose),
         ),
     )
 

@@ -22,8 +22,8 @@ from hwp_bench.evaluation.artifacts import keep_artifacts
 from hwp_bench.evaluation.scoring import (
     WARNINGS,
     colour_warnings,
-    mean_scores,
     read_prediction,
+    read_scorable,
     read_targets,
     score_frames_of,
 )
@@ -33,7 +33,7 @@ from hwp_bench.methods.manifest import MethodManifest, read_manifest, ships
 from hwp_bench.methods.request import write_request
 from hwp_bench.metrics import METRICS, PROTOCOLS
 from hwp_bench.metrics.lpips import load_available
-from hwp_bench.metrics.score import Network
+from hwp_bench.metrics.score import Network, mean_scores
 from hwp_bench.results import CaptureResult, CurvePoint, FreeViewResult, Results
 from hwp_bench.results.schema import ISOLATED
 from hwp_bench.run.engine import Folder, Job, Needs
@@ -246,13 +246,15 @@ def _confinement(evaluation: CaptureEvaluation, output: Path) -> Confinement:
 def _curve(evaluation: CaptureEvaluation, output: Path, facts: RunFacts) -> list[CurvePoint]:
     validation = set(evaluation.split.validation.tolist())
     frames = [frame for frame in dict.fromkeys(facts.checkpoint_frames) if frame in validation]
-    if not frames:
-        return []
-    targets = read_targets(evaluation.capture, frames)
-    curve = []
+    # A validation frame without a hand has no score, which must not cost a whole fit.
+    targets = read_scorable(evaluation.capture, frames)
+    curve: list[CurvePoint] = []
+    if not targets:
+        return curve
     for index, checkpoint in enumerate(facts.checkpoints):
         drawn = score_frames_of(targets, checkpoint_folder(output, index), evaluation.capture.size)
-        curve.append(CurvePoint(**asdict(checkpoint), scores=mean_scores(drawn.scores)))
+        scores = mean_scores(frame.scores for frame in drawn.scores)
+        curve.append(CurvePoint(**asdict(checkpoint), scores=scores))
     return curve
 
 

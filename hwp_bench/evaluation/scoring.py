@@ -100,12 +100,21 @@ def score_frames_of(
     return ScoredFrames(targets, predictions, scores, source)
 
 
+def read_scorable(capture: Capture, frames: Sequence[int]) -> list[Target]:
+    """Read the truth of those of the given frames whose masks leave a pixel to score."""
+    read = (Target(frame, capture.frame(frame), *capture.scoring_mask(frame)) for frame in frames)
+    return [target for target in read if target.region.any()]
+
+
 def read_targets(capture: Capture, frames: Sequence[int]) -> list[Target]:
-    """Read the truth of the given frames, before any method runs."""
-    targets = [
-        Target(frame, capture.frame(frame), *capture.scoring_mask(frame)) for frame in frames
-    ]
-    empty = [target.frame for target in targets if not target.region.any()]
+    """Read the truth of the given frames, before any method runs.
+
+    Raises:
+        BadCapture: a mask leaves no pixel to score.
+    """
+    targets = read_scorable(capture, frames)
+    found = {target.frame for target in targets}
+    empty = [frame for frame in frames if frame not in found]
     if empty:
         one = len(empty) == 1
         words = ("mask of test frame", "leaves") if one else ("masks of test frames", "leave")
@@ -156,13 +165,6 @@ def score_predictions(
         FrameResult(one.frame, scores, one.failure)
         for one, scores in zip(predictions, score_frames(frames, networks=networks), strict=True)
     ]
-
-
-def mean_scores(frames: Sequence[FrameResult]) -> dict[str, float]:
-    """Return the mean of every metric over frames."""
-    return {
-        name: float(np.mean([frame.scores[name] for frame in frames])) for name in frames[0].scores
-    }
 
 
 def predictions_digest(predictions: Sequence[Prediction]) -> str:

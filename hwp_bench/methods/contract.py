@@ -50,7 +50,8 @@ class Method(Protocol):
     """A way to make an avatar from a training capture.
 
     The entry of `method.toml` names a callable that takes `settings` (the preset's table, with
-    the overrides of the command line) and `seed`, and returns an object with this method.
+    the overrides of the command line; `light.degree` is in the table `light`) and `seed`, and
+    returns an object with this method.
     """
 
     def fit(self, training: TrainingCapture, budget: Budget, report: Report) -> Avatar:
@@ -77,7 +78,12 @@ class MethodFactory(Protocol):
 
 
 class Avatar(Protocol):
-    """A fitted hand (or pair of hands) that can be drawn in any pose from any camera."""
+    """A fitted hand (or pair of hands) that can be drawn in any pose from any camera.
+
+    It may have attributes that the result keeps: `steps`, the step of the state that is returned
+    (without it, the last step that was reported), and `device`, such as `cuda` (without it, `cuda`
+    where torch has used it, else `cpu`).
+    """
 
     def render(self, hands: Mapping[str, HandPose], camera: Camera) -> np.ndarray:
         """Draw the hands.

@@ -25,7 +25,7 @@ import numpy as np
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.files import atomic_folder, read_json, write_json
 from hwp_bench.base.images import read_gray, read_rgb
-from hwp_bench.base.records import parse_record, without_schema
+from hwp_bench.base.records import parse_record, unfold, without_schema
 from hwp_bench.capture.schema import (
     FREE_VIEW,
     IMAGE_FOLDERS,
@@ -67,6 +67,7 @@ def write_request(path: Path, capture: Capture, split: Split, run: RunSettings) 
     """Write the part of a capture that a method may see into a folder of its own.
 
     Images are copied, not linked: a link would lead to the capture, and so to its test frames.
+    Settings are tables within tables, however a preset or `--set` names them.
     """
     info = capture.info
     material = choose_training_inputs(capture, split, run.frames)
@@ -100,7 +101,7 @@ def write_request(path: Path, capture: Capture, split: Split, run: RunSettings) 
             fps=info.fps,
             hand_model=info.hand_model,
             split=split.to_json(),
-            settings=dict(run.settings),
+            settings=unfold(run.settings),
             seed=run.seed,
             budget=run.budget,
             frames=run.frames,

@@ -228,7 +228,7 @@ class MethodId:
     name: Line
     #: Name in tables.
     title: Line
-    #: Digest of the method directory's text files.
+    #: Digest of every file and link of the method (`MethodManifest.contents`).
     digest: Line
     #: Preset that was asked for, `default` if none.
     preset: Line

@@ -18,6 +18,7 @@ from hwp_bench.base.console import notice
 from hwp_bench.base.errors import BadInput, BadMethod, MethodFailed, one_line, shown
 from hwp_bench.base.files import inside, read_json, temporary_name, write_json
 from hwp_bench.base.folders import open_up, remove_tree, scratch_folder
+from hwp_bench.base.records import unfold
 from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.manifest import MethodManifest
 from hwp_bench.results.schema import ISOLATED
@@ -176,7 +177,7 @@ def rehearse_method(
     with scratch_folder("hwp-rehearsal-") as scratch:
         request, output = scratch / "request", scratch / "output"
         output.mkdir()
-        asked = {"settings": dict(settings.settings), "seed": settings.seed}
+        asked = {"settings": unfold(settings.settings), "seed": settings.seed}
         write_json(request / REHEARSAL, asked)
         outcome, _ = _run(manifest, request, output, confinement, limits, None, ("--rehearse",))
         if outcome.status != 0:

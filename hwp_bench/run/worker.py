@@ -148,8 +148,7 @@ def run(training: TrainingCapture, factory: MethodFactory, output: Path, draw: D
     report = ReportClock(training.run.budget, record, output / PROGRESS)
     avatar = method.fit(training, training.run.budget, report)
     fit_seconds, cpu = report.elapsed, report.cpu_seconds
-    steps = max((checkpoint.step for checkpoint in report.checkpoints), default=0)
-    final_step = int(getattr(avatar, "steps", steps))
+    final_step = int(getattr(avatar, "steps", report.last))
     explain = getattr(avatar, "write_diagnostics", None)
     if callable(explain):
         explain(output / DIAGNOSTICS)
@@ -169,11 +168,17 @@ def run(training: TrainingCapture, factory: MethodFactory, output: Path, draw: D
         curve_seconds=report.paused,
         steps=final_step,
         peak_memory=peak_memory(),
-        device=str(getattr(avatar, "device", "cpu"))[:100],
+        device=str(getattr(avatar, "device", _used_device()))[:100],
         checkpoint_frames=frames,
         checkpoints=report.checkpoints,
     )
     write_json(output / RUN, asdict(facts))
+
+
+def _used_device() -> str:
+    """Return where a method computed that does not say so: on a GPU if torch has used one."""
+    cuda = sys.modules.get("torch.cuda")
+    return "cuda" if cuda is not None and cuda.is_initialized() else "cpu"
 
 
 def render_free_views(avatar: Avatar, training: TrainingCapture, folder: Path, draw: Draw) -> None:
@@ -304,6 +309,8 @@ class ReportClock:
         self._paused_cpu = 0.0
         self._start_cpu = cpu_seconds()
         self.checkpoints: list[Checkpoint] = []
+        #: The largest step that was reported, whether a checkpoint was due or not.
+        self.last = 0
 
     @property
     def elapsed(self) -> float:
@@ -317,6 +324,8 @@ class ReportClock:
 
     def __call__(self, step: int, avatar: Avatar) -> None:
         """Take a checkpoint if one is due; the first offer is always one."""
+        step = int(step)  # NumPy's cannot be written as JSON
+        self.last = max(self.last, step)
         in_time = self._due and self.elapsed >= self._due[0]
         in_steps = self._due_steps and step >= self._due_steps[0]
         if in_time or in_steps or not self.checkpoints:
@@ -324,6 +333,8 @@ class ReportClock:
 
     def take(self, step: int, avatar: Avatar, seconds: float | None = None) -> None:
         """Take a checkpoint now; the clock stands still meanwhile."""
+        step = int(step)
+        self.last = max(self.last, step)
         seconds = self.elapsed if seconds is None else seconds
         entered, entered_cpu = time.perf_counter(), cpu_seconds()
         self._due = [moment for moment in self._due if moment > seconds]

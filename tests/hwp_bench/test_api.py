@@ -14,8 +14,11 @@ import pytest
 from small_captures import CaptureMaker
 
 import hwp_bench
+from hwp_bench import api
 from hwp_bench.capture import Capture
-from hwp_bench.metrics.score import score_frame
+from hwp_bench.metrics import METRICS
+from hwp_bench.metrics.lpips import load_available
+from hwp_bench.metrics.score import Network, score_frame
 from hwp_bench.results import Results, write_results
 
 METHOD = '''
@@ -153,15 +156,52 @@ def test_a_table_that_is_given_in_part_keeps_the_rest(
     assert results.method.settings == {"gray": 0.5, "light": {"degree": 2, "rate": 0.2}}
 
 
+def test_dotted_names_reach_a_method_as_tables(
+    gray_method: Path, make_capture: CaptureMaker, tmp_path: Path
+) -> None:
+    # Oracle: the table that a reader of TOML makes of the same names.
+    manifest, source = gray_method / "method.toml", gray_method / "gray_method.py"
+    manifest.write_text(manifest.read_text() + "light.degree = 2\nlight.rate = 0.1\n")
+    expected = {"gray": 0.5, "light": {"degree": 0, "rate": 0.1}}
+    line = f"        assert settings == {expected}, settings\n"
+    source.write_text(METHOD.replace("        self.gray", line + "        self.gray"))
+    # It is made twice: before the first capture, and to fit it.
+    capture, changes = make_capture(frames=20, size=48), {"light.degree": 0}
+    results = hwp_bench.evaluate(gray_method, capture, tmp_path / "out", settings=changes)
+    assert results.captures[0].failure is None
+
+
 def test_score_takes_float_images(make_capture: CaptureMaker) -> None:
     capture = make_capture(frames=20, size=48)
     image, mask = capture.frame(0), capture.mask(0)
     gray = np.full_like(image, 128)
-    assert hwp_bench.score(gray, image, mask) == score_frame(gray, image, mask)
-    assert hwp_bench.score(gray / np.float32(255), image / 255.0, mask) == score_frame(
-        gray, image, mask
-    )
+    expected = score_frame(gray, image, mask, networks=load_available())
+    assert hwp_bench.score(gray, image, mask) == expected
+    assert hwp_bench.score(gray / np.float32(255), image / 255.0, mask) == expected
     assert hwp_bench.score(image, image, mask)["psnr"] == 100.0
+
+
+def test_score_has_the_metrics_of_an_evaluation(
+    make_capture: CaptureMaker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Oracle: what an evaluation scores with the same distances, which are the mean error here.
+    asked = []
+
+    def load() -> dict[str, Network]:
+        asked.append(1)
+        return dict.fromkeys(("alex", "vgg", "flip"), lambda a, b: float(abs(a - b).mean()))
+
+    capture = make_capture(frames=20, size=48)
+    image, mask = capture.frame(0), capture.mask(0)
+    dark = image // 2
+    api._networks.cache_clear()
+    monkeypatch.setattr(api, "load_available", load)
+    scores = [hwp_bench.score(dark, image, mask) for _ in range(2)]
+    api._networks.cache_clear()
+    assert scores == [score_frame(dark, image, mask, networks=load())] * 2
+    assert {one.name for one in METRICS} == set(scores[0])
+    # The weights are read once, and by the oracle.
+    assert len(asked) == 2
 
 
 def test_compare_takes_results_and_folders(

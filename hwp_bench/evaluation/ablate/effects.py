@@ -233,7 +233,7 @@ def base_text(ablation: AblationRuns) -> str:
     kept = [
         item.name
         for item in design.kept
-        if any(settings.get(name) != value for name, value in item.settings.items())
+        if any(settings.get(name) != value for name, value in flattened(item.settings))
     ]
     first = design.variants[0]
     parts = [f"Base row: {design.base.name if design.base else 'the method'} {first.title}".strip()]

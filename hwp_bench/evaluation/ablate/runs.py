@@ -10,6 +10,7 @@ from typing import Any, Unpack
 
 from hwp_bench.analysis.pairing import MethodRuns
 from hwp_bench.base.errors import UsageError, did_you_mean
+from hwp_bench.base.records import flattened
 from hwp_bench.capture.splits import Split
 from hwp_bench.commitments.publication import open_captures
 from hwp_bench.evaluation.capture_evaluation import EvaluationSettings
@@ -36,7 +37,7 @@ class Variant:
     title: str
     #: Names of the switches that are thrown.
     thrown: tuple[str, ...]
-    #: Settings that override the preset.
+    #: Settings that override the preset, by dotted name.
     settings: Mapping[str, Any]
 
 
@@ -164,7 +165,7 @@ def _variant(thrown: tuple[Switch, ...]) -> Variant:
     titles = ([f"without {', '.join(out)}"] if out else []) + [f"with {t}" for t in alternatives]
     settings: dict[str, Any] = {}
     for item in thrown:
-        settings |= item.settings
+        settings |= flattened(item.settings)
     return Variant(name_of(thrown), ", ".join(titles), tuple(i.name for i in thrown), settings)
 
 
@@ -251,11 +252,13 @@ def run_ablation(
     opened = open_captures(captures, splits)
     networks = load_available()
     plans, order = {}, []
-    start = design.base.settings if design.base else {}
+    # By dotted name, so that a setting of a table leaves the others of it.
+    start = dict(flattened(design.base.settings)) if design.base else {}
+    asked = dict(flattened(settings.run.settings))
     name = f"{manifest.title} ({design.base.name})" if design.base else manifest.title
     for seed in seeds:
         for variant in design.variants:
-            chosen = {**start, **settings.run.settings, **variant.settings}
+            chosen = {**start, **asked, **variant.settings}
             plans[result_folder(variant.name, seed)] = make_plan(
                 replace(manifest, title=f"{name} {variant.title}".strip()),
                 opened,

@@ -17,6 +17,7 @@ from hwp_bench.base.errors import BadInput, BadMethod, BadResult, UsageError
 from hwp_bench.base.numerics import flushed, flushes
 from hwp_bench.base.records import (
     MAX_CHARACTERS,
+    MAX_DEPTH,
     MAX_TOML_DEPTH,
     Line,
     Text,
@@ -168,6 +169,16 @@ def test_the_caller_chooses_path_error_and_strictness() -> None:
 def test_dotted_names_are_tables() -> None:
     assert unfold({"a.b.c": 1, "a.b": {"d": 2}, "e": 3}) == {"a": {"b": {"c": 1, "d": 2}}, "e": 3}
     assert unfold({"a": {"b.c": 1}, "a.b.c": 2}) == {"a": {"b": {"c": 2}}}
+    assert unfold({"a.b": 1, "a": {"c": 2}}) == {"a": {"b": 1, "c": 2}}
+
+
+def test_a_name_of_thousands_of_parts_makes_a_few_tables() -> None:
+    # A table for each would end Python's recursion. The last name keeps the other parts.
+    tree, levels = unfold({".".join("a" * 5000): 1}), 0
+    while isinstance(tree, dict):
+        ((name, tree),) = tree.items()
+        levels += 1
+    assert (levels, len(name)) == (MAX_DEPTH + 1, 2 * (5000 - MAX_DEPTH) - 1)
 
 
 def test_versions_are_checked() -> None:

@@ -13,13 +13,14 @@ from small_methods import write_submission
 
 from hwp_bench.base.errors import BadCapture, BadImage, BadSplit, UsageError
 from hwp_bench.base.images import write_image
-from hwp_bench.capture import Capture
+from hwp_bench.capture import Capture, CaptureWriter
 from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.cli.main import main
 from hwp_bench.evaluation.capture_evaluation import EvaluationSettings
 from hwp_bench.evaluation.evaluate import default_folder, evaluate, make_budget
 from hwp_bench.methods.contract import Budget, RunSettings
 from hwp_bench.metrics import METRICS, metric, penalty
+from hwp_bench.metrics.score import score_frame
 from hwp_bench.results import Results, read_results
 from hwp_bench.run.sandbox.confinement import Confinement
 
@@ -238,6 +239,26 @@ def test_faults_of_the_capture_are_errors_before_the_method_runs(
     with pytest.raises(BadImage, match=r"000018\.png: is empty"):
         run(method, [single], tmp_path / "out")
     assert not (method.parent / "fits.log").exists()
+
+
+def test_a_validation_frame_without_a_hand_is_left_out_of_the_curve(
+    make_capture: CaptureMaker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Oracle: the score of the other validation frame, which the method's gray has.
+    write, empty = CaptureWriter.mask, {17}
+
+    def blank(writer: CaptureWriter, frame: int, mask: np.ndarray) -> None:
+        write(writer, frame, mask * (frame not in empty))
+
+    monkeypatch.setattr(CaptureWriter, "mask", blank)
+    method, one = counting_method(tmp_path / "method"), make_capture("one", frames=20, size=48)
+    empty |= {16}
+    none = make_capture("none", frames=20, size=48)
+    found, lost = run(method, [one, none], tmp_path / "out").captures
+    assert (found.failure, lost.failure) == (None, None)
+    gray = np.full((48, 48, 3), 0.5)
+    assert found.curve[-1].scores == score_frame(gray, one.frame(16), one.mask(16))
+    assert lost.curve == []
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,9 @@ import pytest
 from small_captures import CaptureMaker
 
 from hwp_bench.cli.main import main
+from hwp_bench.evaluation.capture_evaluation import EvaluationSettings
+from hwp_bench.methods.contents import exposed_digest
+from hwp_bench.methods.manifest import MethodManifest
 
 METHOD = """
 class Method:
@@ -166,6 +169,25 @@ def test_a_sound_call_goes_on_to_render(words: Sequence[str], tmp_path: Path) ->
     _method(tmp_path / "mine")
     with pytest.raises(Rendered):
         main(words)
+
+
+def test_what_is_exposed_is_found_from_another_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _method(tmp_path / "mine")
+    (tmp_path / "weights").mkdir()
+    (tmp_path / "weights" / "net.pth").write_text("mine")
+    exposed: list[Path] = []
+
+    def check(manifest: MethodManifest, settings: EvaluationSettings, *_: object, **__: object):
+        exposed.extend(settings.confinement.exposed)
+        raise Rendered
+
+    monkeypatch.setattr("hwp_bench.evaluation.evaluate.check_call", check)
+    with pytest.raises(Rendered):
+        main(["evaluate", "mine", "--suite", "smoke", "--expose", "weights"])
+    monkeypatch.chdir(tmp_path / "mine")
+    assert exposed_digest(exposed) == exposed_digest([tmp_path / "weights"])
 
 
 def test_a_name_like_none_of_a_method_without_a_list_is_said(tmp_path: Path, capsys) -> None:

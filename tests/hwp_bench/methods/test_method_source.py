@@ -76,6 +76,8 @@ def cells(*sources: str) -> Any:
     """Run cells as a notebook does: their source is kept, and no file is behind them."""
     module = types.ModuleType("notebook_of_the_test")
     sys.modules[module.__name__] = module
+    for name in [name for name in linecache.cache if name.endswith(" of the test>")]:
+        del linecache.cache[name]
     for number, text in enumerate(sources):
         name = f"<cell {number} of the test>"
         linecache.cache[name] = (len(text), None, text.splitlines(keepends=True), name)
@@ -96,6 +98,48 @@ def test_cells_of_a_notebook_are_source_and_the_last_one_counts(tmp_path: Path) 
     # The first cell runs again.
     notebook.level = 1.0
     assert run(write_method(notebook.Mine, tmp_path / "again"), "Mine").value == 1.0
+
+
+USES = "class Mine:\n    def __init__(self, settings, seed):\n        self.value = {}\n"
+
+
+@pytest.mark.parametrize(
+    ("lines", "used"),
+    [
+        ('CONFIG = {"steps": 100}\nCONFIG["steps"] = 500\n', "CONFIG"),
+        ('NAMES = ["a"]\nNAMES.append("b")\n', "NAMES"),
+        ("TOTAL = [1]\nTOTAL += [2]\n", "TOTAL"),
+        ("SIZES = ((1, 2.5), {3: [None]})\nSIZES[1][3].append(True)\n", "SIZES"),
+        ("COUNT = 1\nCOUNT += 1\n", "COUNT"),
+        ("if True:\n    def helper(x):\n        y = x\n        return y\n", "helper(3)"),
+        ("try:\n    class Part:\n        size = 2\nfinally:\n    pass\n", "Part.size"),
+        # A package is set for the process; a new object is not the class.
+        ("import math\nmath.floor(2.5)\n", "math.floor(1.5)"),
+        ("class Part:\n    size = 2\n    def grow(self): pass\nPart().grow()\n", "Part.size"),
+        # What changed it before it was made anew does not count.
+        ("part = set()\npart.add(1)\npart = {2, 3}\n", "part"),
+    ],
+)
+def test_names_have_the_values_that_they_have_here(lines: str, used: str, tmp_path: Path) -> None:
+    notebook = cells(lines, USES.format(used))
+    made = run(write_method(notebook.Mine, tmp_path), "Mine")
+    assert made.value == notebook.Mine({}, 0).value
+
+
+@pytest.mark.parametrize(
+    "change",
+    ["part.x = 1", "part[0] = 1", "part |= {2}", "part.a().b(1)", "for n in 1, 2: part.add(n)"],
+)
+def test_a_value_that_another_statement_changes_is_refused(change: str, tmp_path: Path) -> None:
+    notebook = cells(
+        "class Part:\n    def __getattr__(self, name): return lambda *_: self\n"
+        "    def __setitem__(self, place, value): pass\n    def __ior__(self, more): return self\n"
+        "part = Part()\n",
+        USES.format("part"),
+        change + "\n",
+    )
+    with pytest.raises(UsageError, match=r"^method: uses 'part', which another statement changes"):
+        write_method(notebook.Mine, tmp_path)
 
 
 def test_what_has_no_source_of_its_own_is_refused(tmp_path: Path) -> None:

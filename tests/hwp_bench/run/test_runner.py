@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -72,9 +73,18 @@ def test_a_python_method_fits_and_renders(request_folder: Path, tmp_path: Path) 
     assert facts.fit_seconds > 0
     assert facts.render_seconds > 0
     assert facts.peak_memory > 10**7
-    assert facts.steps == 0 or facts.steps < 16
+    # The last of the 16 steps that it reports, of which few are checkpoints.
+    assert facts.steps == 15
+    assert facts.device == "cpu"
     assert facts.checkpoints[-1].seconds == facts.fit_seconds
     assert facts.checkpoint_frames == [16, 17]
+
+
+def test_a_method_that_uses_a_gpu_need_not_say_so(request_folder: Path, tmp_path: Path) -> None:
+    # In the place of a GPU, what torch says once it has begun to use one.
+    body = "import sys; sys.modules['torch.cuda'] = type('', (), {'is_initialized': lambda: True})"
+    record = _run(python_method(tmp_path / "m", body), request_folder, tmp_path)
+    assert record.facts.device == "cuda"
 
 
 def test_three_channels_are_as_good_as_four(request_folder: Path, tmp_path: Path) -> None:
@@ -209,3 +219,14 @@ def test_a_budget_in_steps_is_checkpointed_every_tenth(tmp_path: Path) -> None:
     for step in range(41):
         clock(step, None)  # type: ignore[arg-type]
     assert [checkpoint.step for checkpoint in clock.checkpoints] == list(range(0, 40, 4))
+
+
+def test_steps_may_be_integers_of_numpy(tmp_path: Path) -> None:
+    # Oracle: the records and the file that Python's own integers make.
+    clock = ReportClock(Budget(), lambda index, avatar: None, tmp_path / "p.json")
+    for step in (np.int64(0), np.int32(3)):
+        clock(step, None)  # type: ignore[arg-type]
+    clock.take(np.uint8(4), None)  # type: ignore[arg-type]
+    assert [type(checkpoint.step) for checkpoint in clock.checkpoints] == [int, int]
+    assert json.dumps([checkpoint.step for checkpoint in clock.checkpoints]) == "[0, 4]"
+    assert clock.last == 4

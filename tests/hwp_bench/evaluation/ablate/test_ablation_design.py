@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from hwp_bench.base.console import clock, remaining
 from hwp_bench.base.errors import BadMethod, UsageError
-from hwp_bench.evaluation.ablate.runs import make_design
+from hwp_bench.base.records import unfold
+from hwp_bench.evaluation.ablate.runs import make_design, run_ablation
+from hwp_bench.evaluation.capture_evaluation import EvaluationSettings
+from hwp_bench.evaluation.evaluate import Plan
+from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.manifest import MethodManifest, read_manifest
 
 MANIFEST = """
@@ -116,6 +121,61 @@ kept = ["c"]
         (tmp_path / "method.toml").write_text(MANIFEST + table.replace(old, new))
         with pytest.raises(BadMethod, match=r"bases\.bare.*(not a component|there twice)"):
             read_manifest(tmp_path)
+
+
+TABLES = """
+[presets.default]
+light.degree = 2
+light.lamp = true
+light.rate = 0.1
+[switches.sh]
+settings_off = {light.degree = 0}
+[switches.lamp]
+settings_off = {light.lamp = false}
+[bases.slow]
+settings = {light.rate = 0.01}
+crossed = ["sh", "lamp"]
+"""
+
+
+@pytest.mark.parametrize(
+    ("base", "asked", "rate"),
+    [
+        (None, {}, 0.1),
+        ("slow", {}, 0.01),
+        (None, {"light": {"rate": 0.2}}, 0.2),
+        ("slow", {"light.rate": 0.2}, 0.2),
+    ],
+)
+def test_settings_of_one_table_do_not_replace_each_other(
+    base: str | None,
+    asked: dict[str, Any],
+    rate: float,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # Oracle: the table of each variant by hand.
+    (tmp_path / "method.toml").write_text(MANIFEST.split("[switches.a]")[0] + TABLES)
+    manifest, light = read_manifest(tmp_path), {}
+
+    def keep(out: Path, plans: dict[str, Plan], *_: object, **__: object) -> None:
+        for folder, plan in plans.items():
+            light[folder] = unfold(plan.settings.run.settings)["light"]
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("hwp_bench.evaluation.ablate.runs.run_plans", keep)
+    settings = EvaluationSettings(run=RunSettings(asked))
+    with pytest.raises(KeyboardInterrupt):
+        run_ablation(manifest, make_design(manifest, base=base), [], tmp_path, settings, [0])
+    assert light == {
+        f"variants/{name}/seed-0": {"degree": degree, "lamp": lamp, "rate": rate}
+        for name, degree, lamp in (
+            ("no-sh+no-lamp", 0, False),
+            ("no-sh", 0, True),
+            ("no-lamp", 2, False),
+            ("full", 2, True),
+        )
+    }
 
 
 def test_the_remaining_time_ignores_what_was_found_finished() -> None:

@@ -35,7 +35,7 @@ settings_off = {pao = false}
 [switches.prior]
 settings_off = {prior = ""}
 [switches.light]
-settings_off = {light = false}
+settings_off = {light.on = false}
 """
 #: dB that each variant has more than the barest, and seconds of its fit of 100 steps.
 GAINS = {
@@ -139,11 +139,11 @@ def test_the_base_row_says_what_it_keeps(ablation: AblationRuns) -> None:
         return replace(ablation, runs=runs, settings=settings)
 
     # What a setting takes out of all rows is not kept.
-    assert base_text(changed(light=False)) == (
+    assert base_text(changed(light={"on": False})) == (
         "Base row: the method without DPD, PAO; keeps prior, as all rows do; set in all rows: "
-        "light=False."
+        "light.on=False."
     )
-    assert "keeps no other component" in base_text(changed(light=False, prior=""))
+    assert "keeps no other component" in base_text(changed(**{"light.on": False, "prior": ""}))
 
 
 def test_costs_are_those_that_were_put_in(tables) -> None:
