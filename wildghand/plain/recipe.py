@@ -43,7 +43,7 @@ from wildghand.splat.threads import denormals_flushed
 # Adam's epsilon: gradients of a mean over all pixels are small.
 _EPSILON = 1e-15
 _BETAS = (0.9, 0.99)
-# A fit ends with a mean of its steps, nearly all of it from this share of them, the last ones.
+# A fit ends with a running mean of its steps, two thirds of it from the last tenth of them.
 _AVERAGE_SHARE = 0.1
 
 
@@ -67,9 +67,9 @@ class LoopSettings:
     #: The steps' size at the end of the budget, as a share of that at its start; in between it
     #: falls geometrically.
     final_rate: float = number(0.05, 1e-6, 1.0)
-    #: End with the mean of the last tenth of the steps, or with an earlier such mean that draws the
-    #: validation frames better; with fewer than four of these it is the last one. Without: end
-    #: with the last step.
+    #: End with a running mean, two thirds of it from the last tenth of the steps, or with an
+    #: earlier such mean that draws the validation frames better; with fewer than four of these it
+    #: is the last one. Without: end with the last step.
     validated: bool = True
     #: `auto` (CUDA where both a GPU and gsplat are there), `cpu` or `cuda`.
     device: str = choice("auto", "cpu", "cuda")
@@ -146,9 +146,9 @@ class Drawing:
 class Recipe(IterativeFit[Avatar], Generic[Settings]):
     """A fit with its hooks. The plain fit is one; a method with a model of its own is another.
 
-    Each step calls `draw`, `weights`, `loss` and, after Adam's step, `move_back`; not the last one
-    where a gradient is not finite, for then nothing has moved. What any method can have is here:
-    the mean of the last steps, and the choice of an earlier state by validation frames
+    Each step calls `draw`, `weights`, `loss` and, after Adam's step, `move_back`, which is left out
+    where a gradient is not finite: nothing has moved then. What any method can have is here: the
+    running mean of the steps, and the choice of an earlier state by validation frames
     (`wildghand.plain.choice`).
     Hooks keep what they need as attributes; tensors that Adam fits are named by `parameters`.
 
