@@ -147,8 +147,9 @@ def anchor_frames(
 
 def anchor_uv(template: HandTemplate, anchors: SurfaceAnchors) -> np.ndarray:
     """Return the anchors' texture coordinates: (N, 2) in [0, 1], origin at the bottom left."""
-    corners = template.uv[template.face_uv[np.asarray(anchors.face_index)]]
-    return (corners * np.asarray(anchors.barycentric, dtype=np.float64)[..., None]).sum(axis=1)
+    faces = torch.as_tensor(anchors.face_index).cpu().numpy()
+    mix = torch.as_tensor(anchors.barycentric).cpu().double().numpy()
+    return (template.uv[template.face_uv[faces]] * mix[..., None]).sum(axis=1)
 
 
 def vertex_normals(vertices: torch.Tensor, faces: torch.Tensor) -> torch.Tensor:

@@ -128,6 +128,16 @@ def test_places_are_in_the_hand_s_own_size() -> None:
     assert (inside > 0.95).all()
 
 
+def test_gaussians_without_extent_lie_in_the_middle() -> None:
+    corners = torch.rand(4, 3, 3, generator=torch.Generator().manual_seed(0))
+    mix = torch.full((4, 3), 1.0 / 3.0)
+    assert places_at_rest(corners[:1], mix[:1]).tolist() == [[0.5, 0.5, 0.5]]
+    corners[..., 1] = 0.0
+    flat = places_at_rest(corners, mix)
+    assert flat[:, 1].tolist() == [0.5] * 4
+    assert (flat[:, 0] != 0.5).all()
+
+
 def wild_recipe(make_training: TrainingMaker, **settings: object) -> WildRecipe:
     return WildRecipe(material_of(make_training()), WildMethod({**QUICK, **settings}).settings)
 

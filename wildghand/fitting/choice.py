@@ -155,7 +155,7 @@ class JudgedDrawings:
 
 
 class AveragedSteps(Averaging, Component):
-    """A fit ends with the mean of its last steps; see `Averaging`."""
+    """A fit ends with a running mean of its steps; see `Averaging`."""
 
     def begin(self, fit: Fit) -> None:
         """Take what the fit's steps move."""

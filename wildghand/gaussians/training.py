@@ -159,17 +159,27 @@ def load_judges(training: TrainingCapture) -> TrainingFrames | None:
 
 
 def load_validation_frames(training: TrainingCapture, most: int) -> TrainingFrames:
-    """Read at most so many validation frames, evenly spread; there may be none.
+    """Read at most so many validation frames, evenly spread over the usable; there may be none.
 
     What is fitted too is left out.
     """
-    apart = np.setdiff1d(training.validation, training.train)
-    return _read_frames(training, apart[evenly(len(apart), most)])
+    apart, valid = np.setdiff1d(training.validation, training.train), _valid(training)
+    usable = [f for f in apart.tolist() if valid[f] and _shows_hand(training.mask(f))]
+    return _read_frames(training, np.array(usable, np.int64)[evenly(len(usable), most)])
+
+
+def _valid(training: TrainingCapture) -> np.ndarray:
+    """In which frames the parameters of all hands are valid: (F,) bool."""
+    return np.all([hand.valid for hand in training.hands.values()], axis=0)
+
+
+def _shows_hand(mask: np.ndarray) -> bool:
+    return bool((mask > 127).any())
 
 
 def _read_frames(training: TrainingCapture, numbers: np.ndarray) -> TrainingFrames:
     """Read those of the frames that show a hand and whose parameters are valid."""
-    valid = np.all([hand.valid for hand in training.hands.values()], axis=0)
+    valid = _valid(training)
     kept: list[int] = []
     # Filled frame by frame: a list of frames that is stacked in the end would hold all of them
     # twice. Memory of frames that are left out is never touched.
@@ -179,7 +189,7 @@ def _read_frames(training: TrainingCapture, numbers: np.ndarray) -> TrainingFram
         if not valid[frame]:
             continue
         mask = training.mask(frame)
-        if (mask > 127).any():
+        if _shows_hand(mask):
             images[len(kept)] = training.frame(frame)
             masks[len(kept)] = mask
             kept.append(frame)

@@ -74,8 +74,8 @@ class ScheduleSettings:
     #: How `fast` rates fall: `root` (to 0.3, and with the root of the steps, so that a long fit
     #: ends with lower rates than a short one) or `geometric` (to 0.05).
     decay: str = choice("root", "geometric")
-    #: The fit ends with a mean of its steps, nearly all of it from this share of them, the last
-    #: ones; 0: with the last step.
+    #: The fit ends with a running mean of its steps: for 0.1, two thirds of it are from the last
+    #: tenth of them (`Averaging`); 0: with the last step.
     average_share: float = number(0.1, 0.0, 1.0)
     #: Addition: after the last step, go back to an earlier state of the fit where that draws the
     #: validation frames better. With fewer than four of these frames it ends with the last state.

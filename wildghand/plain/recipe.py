@@ -17,7 +17,7 @@ import torch
 
 from hwp_bench.methods.contract import Avatar, Budget, Report, TrainingCapture
 from hwp_bench.methods.settings import choice, number, settings_from
-from wildghand.gaussians.adam import ClippedAdam
+from wildghand.gaussians.adam import LARGEST, ClippedAdam
 from wildghand.gaussians.fit_loop import batches, ready_device
 from wildghand.gaussians.losses import photometric_loss
 from wildghand.gaussians.shading import MAX_DEGREE
@@ -43,7 +43,7 @@ from wildghand.splat.threads import denormals_flushed
 # Adam's epsilon: gradients of a mean over all pixels are small.
 _EPSILON = 1e-15
 _BETAS = (0.9, 0.99)
-# A fit ends with a mean of its steps, nearly all of it from this share of them, the last ones.
+# A fit ends with a running mean of its steps, two thirds of it from the last tenth of them.
 _AVERAGE_SHARE = 0.1
 
 
@@ -67,9 +67,9 @@ class LoopSettings:
     #: The steps' size at the end of the budget, as a share of that at its start; in between it
     #: falls geometrically.
     final_rate: float = number(0.05, 1e-6, 1.0)
-    #: End with the mean of the last tenth of the steps, or with an earlier such mean that draws the
-    #: validation frames better; with fewer than four of these it is the last one. Without: end
-    #: with the last step.
+    #: End with a running mean, two thirds of it from the last tenth of the steps, or with an
+    #: earlier such mean that draws the validation frames better; with fewer than four of these it
+    #: is the last one. Without: end with the last step.
     validated: bool = True
     #: `auto` (CUDA where both a GPU and gsplat are there), `cpu` or `cuda`.
     device: str = choice("auto", "cpu", "cuda")
@@ -146,9 +146,10 @@ class Drawing:
 class Recipe(IterativeFit[Avatar], Generic[Settings]):
     """A fit with its hooks. The plain fit is one; a method with a model of its own is another.
 
-    Each step calls `draw`, `weights`, `loss` and, after Adam's step, `move_back`. What any
-    method can have is here: the mean of the last steps, and the choice of an earlier state by
-    validation frames (`wildghand.plain.choice`).
+    Each step calls `draw`, `weights`, `loss` and, after Adam's step, `move_back`, which is left out
+    where a gradient is not finite: nothing has moved then. What any method can have is here: the
+    running mean of the steps, and the choice of an earlier state by validation frames
+    (`wildghand.plain.choice`).
     Hooks keep what they need as attributes; tensors that Adam fits are named by `parameters`.
 
     Args:
@@ -161,6 +162,7 @@ class Recipe(IterativeFit[Avatar], Generic[Settings]):
         self.settings = settings
         self.device = material.device
         self._steps = 0
+        self._skipped = 0
 
     def parameters(self) -> dict[str, torch.Tensor]:
         """The tensors that Adam fits, by name, in a fixed order."""
@@ -247,11 +249,16 @@ class Recipe(IterativeFit[Avatar], Generic[Settings]):
             return value
         optimizer.clear()
         loss.backward()
-        if optimizer.take_step(loss):  # a gradient is not finite: the fit has diverged
-            return math.nan
-        self.move_back(drawn)
+        if optimizer.take_step(loss):  # a gradient is not finite: nothing has moved
+            self._skipped += 1
+        else:
+            self.move_back(drawn)
         self._steps += 1
         return value
+
+    def skipped(self) -> int:
+        """See `IterativeFit`."""
+        return self._skipped
 
     @functools.cached_property
     def _optimizer(self) -> ClippedAdam:
@@ -319,8 +326,11 @@ class Recipe(IterativeFit[Avatar], Generic[Settings]):
         return len(self._judges) * (time.perf_counter() - begun)
 
     def finite(self) -> bool:
-        """Whether every fitted number is finite."""
-        return all(bool(value.isfinite().all()) for value in self.parameters().values())
+        """Whether every fitted number is finite; one beyond `LARGEST` is not, as in gradients.
+
+        A fit that explodes skips its steps from then on, with a loss that may be finite.
+        """
+        return all(bool((value.abs() <= LARGEST).all()) for value in self.parameters().values())
 
     def snapshot(self) -> dict[str, torch.Tensor]:
         """Copies of the state, which the fit no longer changes."""

@@ -12,8 +12,14 @@ from typing import Any
 import torch
 
 from hwp_bench.base.errors import UsageError
-from wildghand.splat.conventions import MAX_COLOR
-from wildghand.splat.scene import FlatScene, Options, check_options, flatten, unflattened
+from wildghand.splat.scene import (
+    FlatScene,
+    Options,
+    check_options,
+    flatten,
+    good_backgrounds,
+    unflattened,
+)
 
 #: Values of `backend`.
 BACKENDS = ("auto", "numba", "gsplat", "reference")
@@ -198,7 +204,7 @@ def _one_dtype(scene: FlatScene, backend: str) -> FlatScene:
 
 def _usable_views(scene: FlatScene) -> FlatScene:
     """Warns of cameras that see nothing; makes backgrounds that are not finite black."""
-    if scene.means.is_cuda:  # the backend does so without another copy to the host
+    if scene.means.is_cuda:  # backends do the latter, without another copy to the host
         return scene
     finite = math.isfinite(scene.viewmats.detach().sum() + scene.Ks.detach().sum())
     if not finite and not (scene.viewmats.isfinite().all() and scene.Ks.isfinite().all()):
@@ -207,7 +213,7 @@ def _usable_views(scene: FlatScene) -> FlatScene:
         warnings.warn("rasterize: a camera has no positive focal length; it sees nothing")
     if scene.backgrounds is None:
         return scene
-    good = scene.backgrounds.detach().abs() <= MAX_COLOR
+    good = good_backgrounds(scene.backgrounds)
     if good.all():
         return scene
     warnings.warn("rasterize: a background is not finite or beyond MAX_COLOR; drawn black")

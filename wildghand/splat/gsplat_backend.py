@@ -17,9 +17,8 @@ from typing import Any
 import torch
 
 from hwp_bench.base.errors import MissingDependency
-from wildghand.splat import conventions as rules
 from wildghand.splat.reference import rasterize_reference
-from wildghand.splat.scene import FlatScene, largest, usable
+from wildghand.splat.scene import FlatScene, good_backgrounds, largest, usable
 
 #: Beyond this, squares of lengths leave float32 inside gsplat.
 _MAX_LENGTH = 1e15
@@ -121,7 +120,7 @@ def _harmless(scene: FlatScene) -> dict[str, torch.Tensor]:
         visible = visible & _repeat(mask, finest)
     result["opacities"] = torch.where(visible, _repeat(opacities, finest), zero)
     if scene.backgrounds is not None:
-        fine = scene.backgrounds.detach().abs() <= rules.MAX_COLOR
+        fine = good_backgrounds(scene.backgrounds)
         result["backgrounds"] = torch.where(fine, scene.backgrounds, zero)
     for name in ("viewmats", "Ks"):
         result[name] = _replaced(result[name], cameras, neutral[name])

@@ -16,6 +16,7 @@ from wildghand.splat.scene import (
     Options,
     channels_with_depth,
     expected_depth,
+    good_backgrounds,
     per_image,
     unflattened,
     usable,
@@ -63,6 +64,7 @@ def rasterize_reference(scene: FlatScene) -> tuple[torch.Tensor, torch.Tensor, d
     channels = per_image(channels, images)
     if backgrounds is None:
         backgrounds = channels.new_zeros(images, channels.shape[-1])
+    backgrounds = torch.where(good_backgrounds(backgrounds), backgrounds, 0.0)
     drawn = [
         blend(
             flat["means2d"][i][index],

@@ -104,6 +104,11 @@ def usable(
     return gaussians, cameras & scene.viewmats.detach().flatten(1).isfinite().all(1)
 
 
+def good_backgrounds(backgrounds: torch.Tensor) -> torch.Tensor:
+    """Which numbers of backgrounds can be drawn; what stands in for others is black."""
+    return backgrounds.detach().abs() <= MAX_COLOR
+
+
 def channel_count(scene: FlatScene) -> int:
     """How many channels are blended in the scene's render mode."""
     mode = scene.options.render_mode

@@ -22,7 +22,7 @@ import os
 import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
@@ -215,16 +215,30 @@ def _openmp() -> Callable[[Callable[[int], None], int], None] | None:
 
 
 def _plain_threads(work: Callable[[int], None], threads: int) -> None:
-    helpers = []
+    # Not the pool's own futures: where no thread can be started it gives none, yet one of its
+    # threads may still begin what was handed over.
+    helpers: list[Future[None]] = [Future() for _ in range(1, threads)]
     try:
         pool = _pool(os.getpid(), max(torch.get_num_threads(), threads) - 1)
-        helpers = [pool.submit(work, worker) for worker in range(1, threads)]
+        for worker, helper in enumerate(helpers, start=1):
+            pool.submit(_help, helper, work, worker)
     except RuntimeError:
         pass  # the interpreter is shutting down, or no more threads can be started
     work(0)
     for helper in helpers:
         if not helper.cancel():  # one that has not begun is not needed: the jobs are all taken
             helper.result()
+
+
+def _help(helper: Future[None], work: Callable[[int], None], worker: int) -> None:
+    """Do a worker's part, unless the caller has done it meanwhile."""
+    if helper.set_running_or_notify_cancel():
+        try:
+            work(worker)
+        except BaseException as error:  # for the caller
+            helper.set_exception(error)
+        else:
+            helper.set_result(None)
 
 
 @functools.lru_cache(maxsize=2)

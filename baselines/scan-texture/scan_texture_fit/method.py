@@ -155,8 +155,8 @@ class ScanHand(nn.Module):
 
     def __init__(self, rig: HandRig, uv: Tensor, color: Tensor, settings: ScanSettings) -> None:
         super().__init__()
-        count, corners = len(rig), rig.template.faces[rig.anchors.face_index]
-        weights = torch.as_tensor(rig.anchors.barycentric, dtype=torch.float32)
+        count, corners = len(rig), rig.template.faces[rig.anchors.face_index].cpu()
+        weights = torch.as_tensor(rig.anchors.barycentric, dtype=torch.float32).cpu()
         self._from_vertices = FixedGather(
             torch.arange(count).repeat_interleave(3),
             corners.flatten(),
@@ -326,13 +326,12 @@ class ScanRecipe(Recipe[ScanSettings]):
             for side, template in templates.items()
         }
         self._uv = {
-            side: torch.as_tensor(
-                anchor_uv(templates[side], rig.anchors), dtype=torch.float32, device=device
-            )
+            side: torch.as_tensor(anchor_uv(templates[side], rig.anchors), dtype=torch.float32)
             for side, rig in rigs.items()
         }
         torch.manual_seed(material.seed)
-        color = material.frames.mean_color().to(device)
+        # Made on the CPU, of tensors that are there, and brought to the device as a whole.
+        color = material.frames.mean_color()
         self.model = ScanModel(rigs, self._uv, color, settings).to(device)
         self.clip = TrainingClip(training, material.frames.indices, rigs, device)
         self.corrections = PoseCorrections(self.clip)

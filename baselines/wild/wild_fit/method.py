@@ -114,11 +114,13 @@ def appear(
 def places_at_rest(corners: torch.Tensor, barycentric: torch.Tensor) -> torch.Tensor:
     """Where Gaussians in triangles (N, 3, 3) are at rest, in the hand's own size: (N, 3).
 
-    They are centred at 0.5; 97 % of the coordinates of each axis lie in [0, 1].
+    They are centred at 0.5; 97 % of the coordinates of each axis lie in [0, 1]. Along an axis in
+    which they have no extent, as a single one has none, they all lie at 0.5.
     """
     places = (corners * barycentric[..., None]).sum(dim=1)
     places = places - places.mean(dim=0)
-    return 0.5 + 0.5 * places / torch.quantile(places.abs(), 0.97, dim=0)
+    size = torch.quantile(places.abs(), 0.97, dim=0)
+    return 0.5 + 0.5 * places / torch.where(size > 0.0, size, 1.0)
 
 
 # What the geometry gets of the gradient of the uncertainty: nothing that matters.

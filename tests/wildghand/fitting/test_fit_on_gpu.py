@@ -17,6 +17,8 @@ from tiny_fits import QUICK
 
 from hwp_bench.methods.contract import Budget, TrainingCapture
 from plain_fit.method import PlainMethod
+from scan_texture_fit.method import ScanMethod
+from texture_space_fit.method import SpaceMethod
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import load_avatar, save_avatar
 from wildghand.fitting.components import make_fit
@@ -26,6 +28,7 @@ from wildghand.fitting.session import load_state, save_state
 from wildghand.gaussians.fit_loop import choose_device, ready_device
 from wildghand.model.settings import read_settings
 from wildghand.plain.loop import Watchers, run_fit
+from wildghand.plain.recipe import RecipeMethod
 
 HAS_GPU = choose_device("auto").type == "cuda"
 pytestmark = pytest.mark.skipif(not HAS_GPU, reason="needs a GPU and gsplat")
@@ -106,13 +109,13 @@ def test_a_stopped_fit_goes_on(make_training: TrainingMaker, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("hands", ["right", "both"])
-def test_the_plain_fit_scores_as_on_the_cpu(hands: str, make_training: TrainingMaker) -> None:
+@pytest.mark.parametrize("kind", [PlainMethod, ScanMethod, SpaceMethod])
+def test_a_baseline_scores_as_on_the_cpu(
+    kind: type[RecipeMethod], hands: str, make_training: TrainingMaker
+) -> None:
     training = make_training(hands)
     scores = [
-        psnr(
-            PlainMethod({**SMALL, "device": device}, 0).fit(training, Budget(), SilentReport()),
-            training,
-        )
+        psnr(kind({**SMALL, "device": device}, 0).fit(training, Budget(), SilentReport()), training)
         for device in ("cpu", "cuda")
     ]
     assert scores[1] == pytest.approx(scores[0], abs=0.5)

@@ -11,15 +11,19 @@ import pytest
 import torch
 from painted import FRAMES, SIZE, TrainingMaker
 
+from hwp_bench.base.arrays import evenly
 from hwp_bench.base.errors import BadInput
 from hwp_bench.base.images import write_image
+from hwp_bench.capture.splits import Split
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.gaussians.rig import make_rig
 from wildghand.gaussians.training import (
+    MOST_CHOOSING,
     FrameTable,
     TrainingClip,
     TrainingFrames,
     load_frames,
+    load_judges,
     soft_weights,
 )
 
@@ -57,6 +61,24 @@ def test_a_capture_without_a_usable_frame_is_an_error(make_training: TrainingMak
     invalidate(training, "right", list(range(FRAMES)))
     with pytest.raises(BadInput, match="none of 32 training frames"):
         load_frames(training)
+
+
+def test_the_frames_that_choose_are_spread_over_the_usable(make_training: TrainingMaker) -> None:
+    """Half of 16 frames cannot be used, among them each that would be taken of all of them."""
+    training = make_training()
+    training.split = Split(training.id, FRAMES, (0, 20), (20, 36), (36, FRAMES))
+    training._train = training.split.train
+    validation = np.arange(20, 36)
+    sound = load_judges(training)
+    assert sound is not None
+    taken = validation[evenly(16, MOST_CHOOSING)]
+    np.testing.assert_array_equal(sound.indices, taken)
+    invalidate(training, "right", taken[:7].tolist())
+    empty = training.root / "masks" / f"{taken[7]:06d}.png"
+    write_image(empty, np.zeros((SIZE, SIZE), np.uint8))
+    judges = load_judges(training)
+    assert judges is not None
+    np.testing.assert_array_equal(judges.indices, np.setdiff1d(validation, taken))
 
 
 def test_targets_are_black_and_light_outside_the_mask() -> None:

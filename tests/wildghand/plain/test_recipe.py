@@ -11,7 +11,7 @@ from painted import QUICK, SilentReport, TrainingMaker
 from hwp_bench.base.errors import DidNotConverge
 from hwp_bench.methods.contract import Budget
 from wildghand.gaussians.training import load_frames
-from wildghand.plain.loop import run_fit
+from wildghand.plain.loop import WINDOW, run_fit
 from wildghand.plain.model import PlainAvatar
 from wildghand.plain.recipe import Batch, Drawing, FitInputs, FitSettings, PlainRecipe, RecipeMethod
 
@@ -124,6 +124,62 @@ def test_a_fit_that_diverges_later_goes_back_to_its_best_state(
     assert isinstance(avatar, PlainAvatar)
     assert avatar.steps in (50, 100)
     assert recipe.finite()
+
+
+class Slopeless(FrameGain):
+    """Some steps have a finite loss whose gradient is not finite.
+
+    Attributes:
+        broken: these steps, by number.
+        states: what each of them left.
+    """
+
+    broken = range(3, 4)
+
+    def __init__(self, material: FitInputs, settings: FitSettings) -> None:
+        super().__init__(material, settings)
+        self.states: dict[int, dict[str, torch.Tensor]] = {}
+
+    def loss(self, batch: Batch, drawing: Drawing, weights: torch.Tensor) -> torch.Tensor:
+        loss = super().loss(batch, drawing, weights)
+        if batch.step in self.broken:
+            loss = loss + (0.0 * self.log_gains).sqrt().sum()
+        return loss
+
+    def after_step(self) -> None:
+        self.states[len(self.states)] = self.snapshot()
+        super().after_step()
+
+
+def slopeless(make_training: TrainingMaker, broken: range) -> Slopeless:
+    plain = gain_recipe(make_training, validated=False)
+    recipe = Slopeless(plain.material, plain.settings)
+    recipe.broken = broken
+    return recipe
+
+
+def test_a_step_whose_gradient_is_no_number_is_skipped(
+    make_training: TrainingMaker, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Oracles: nothing moves in that step, everything in the next; the fit is as long as asked."""
+    recipe = slopeless(make_training, range(3, 4))
+    avatar = run_fit(recipe, Budget(steps=6), SilentReport())
+    assert isinstance(avatar, PlainAvatar)
+    assert avatar.steps == 6
+    assert recipe.skipped() == 1
+    assert recipe.calls.count("move_back") == 5
+    kept, states = recipe.states[2], recipe.states
+    assert all(torch.equal(value, kept[name]) for name, value in states[3].items())
+    assert not torch.equal(states[4]["offsets"], kept["offsets"])
+    assert "1 of 6 steps were skipped" in capsys.readouterr().err
+
+
+def test_only_a_window_of_skipped_steps_ends_a_fit(make_training: TrainingMaker) -> None:
+    """49 of the second window's 50 steps are skipped, then all of them."""
+    recipe = slopeless(make_training, range(WINDOW, 2 * WINDOW - 1))
+    assert run_fit(recipe, Budget(steps=120), SilentReport()).steps == 120  # type: ignore[attr-defined]
+    recipe = slopeless(make_training, range(WINDOW, 2 * WINDOW))
+    assert run_fit(recipe, Budget(steps=120), SilentReport()).steps == WINDOW  # type: ignore[attr-defined]
 
 
 def test_a_fit_that_diverges_at_once_says_so(make_training: TrainingMaker) -> None:

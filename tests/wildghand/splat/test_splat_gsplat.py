@@ -187,6 +187,22 @@ def test_no_gaussians_are_not_handed_on(monkeypatch: pytest.MonkeyPatch) -> None
     assert info["means2d"].shape == (2, 0, 2)
 
 
+@pytest.mark.parametrize("bad", [math.nan, math.inf, 1e30])
+def test_a_bad_background_is_black_without_gaussians(
+    monkeypatch: pytest.MonkeyPatch, bad: float
+) -> None:
+    """On a GPU nobody has made it black before the reference draws it."""
+    tensors = variant("one set")
+    for name in ("means", "quats", "scales", "opacities", "colors"):
+        tensors[name] = tensors[name][:0]
+    expected = tensors["backgrounds"].clone()
+    tensors["backgrounds"] = expected.clone()
+    tensors["backgrounds"][0, 1] = bad
+    expected[0, 1] = 0.0
+    _, image, _, _ = through(monkeypatch, "1.5.3", tensors)
+    torch.testing.assert_close(image, expected[:, None, None].expand(2, 30, 40, 3))
+
+
 def test_an_old_or_missing_gsplat_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gsplat", StandIn("1.4.0"))
     with pytest.raises(MissingDependency, match=r"1\.4\.0, and the CUDA backend needs"):

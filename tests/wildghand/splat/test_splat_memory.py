@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import gc
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -112,6 +115,36 @@ def test_failures_of_any_thread_are_raised() -> None:
         except ValueError:
             return
     pytest.fail("the failure was lost")
+
+
+class OneThread(ThreadPoolExecutor):
+    """A pool on a machine that starts one thread and no other."""
+
+    def _adjust_thread_count(self) -> None:
+        if self._threads:
+            raise RuntimeError("can't start new thread")
+        super()._adjust_thread_count()
+
+
+def test_helpers_are_waited_for_where_a_thread_cannot_be_started(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The pool's one thread goes on with the part that no thread was started for, and fails."""
+    begun = threading.Event()
+
+    def fail(worker: int, counters: np.ndarray, ends: np.ndarray) -> None:
+        if worker == 0:
+            assert begun.wait(60.0)
+        if worker == 2:
+            begun.set()
+            time.sleep(0.05)  # the caller is done before
+            raise ValueError("no")
+
+    with OneThread(2) as pool:
+        monkeypatch.setattr(memory, "_openmp", lambda: None)
+        monkeypatch.setattr(memory, "_pool", lambda process, threads: pool)
+        with pytest.raises(ValueError, match="no"):
+            run(fail, even_jobs(3, 3))
 
 
 def test_thread_count_follows_torch() -> None:
