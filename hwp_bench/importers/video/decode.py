@@ -177,6 +177,12 @@ def read_times(path: str | os.PathLike[str]) -> np.ndarray | None:
     return np.asarray(times - times[0])
 
 
+def count_frames(path: str | os.PathLike[str]) -> int:
+    """Decode a video to its end and count its frames."""
+    with _opened(Path(path)) as video:
+        return sum(1 for _ in video.frames())
+
+
 @dataclass(frozen=True, eq=False)
 class ClipImages:
     """The frames of a clip at two resolutions."""
