@@ -300,6 +300,7 @@ def _track(args: argparse.Namespace) -> int:
         settings=TrackerSettings(args.hands, min_palm_score=least, min_presence=least),
         model=args.model,
         overwrite=args.overwrite,
+        unseen=args.sheet,
     )
     if args.sheet is not None:
         from hwp_bench.base.images import write_image
