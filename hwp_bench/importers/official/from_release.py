@@ -65,6 +65,8 @@ from hwp_bench.taxonomy import catalogue
 MASK_THRESHOLD = 100
 #: The joints' box is enlarged by this, as where the release has a box.
 BOX_SCALE = 1.5
+#: Largest box, in longer edges of the image: that of a hand is wrong beyond.
+MOST_BOX = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +94,7 @@ def crop_frames(
     """
 
     def one(frame: int) -> tuple[CroppedFrame, tuple[float, float]]:
-        image = read_rgb(records.images[frame])
+        image, key = read_rgb(records.images[frame]), "bbox_inter"
         mask = read_gray(records.masks[frame], image.shape[:2])
         box = records.boxes[frame]
         if box is None and compat:
@@ -104,10 +106,23 @@ def crop_frames(
                 remedy="Import it without --official-compat.",
             )
         if box is None:
-            seen = [hand.landmarks[frame] for hand in records.sides.values() if hand.valid[frame]]
+            seen = {
+                side: hand.landmarks[frame].clip(-1e9, 1e9)
+                for side, hand in records.sides.items()
+                if hand.valid[frame]
+            }
             if not seen:
                 raise BadInput("has neither a box nor a hand", where=records.images[frame])
-            box = box_of_landmarks(np.concatenate(seen))
+            key = f"joints2d_world_{max(seen, key=lambda side: np.abs(seen[side]).max())}"
+            box = box_of_landmarks(np.concatenate(list(seen.values())))
+        edge = float(max(box[2] - box[0], box[3] - box[1]))
+        if edge > MOST_BOX * max(image.shape[:2]):
+            raise BadInput(
+                f"frame {records.numbers[frame]}: the hands' box is {edge:.0f} px large",
+                where=records.images[frame],
+                field=key,
+                remedy="Correct the record, or leave it out.",
+            )
         crop = official_crop if compat else correct_crop
         height, width = image.shape[:2]
         cropped = crop(image, mask, box, float(records.focal[frame]), size)

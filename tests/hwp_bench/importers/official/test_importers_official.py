@@ -32,7 +32,12 @@ from hwp_bench.capture.splits import contiguous_split, split_for
 from hwp_bench.cli.main import main
 from hwp_bench.hands import HandTemplate, load_template, pose_hand
 from hwp_bench.importers.official import OfficialImport, import_official
-from hwp_bench.importers.official.from_release import box_of_landmarks, correct_crop, official_crop
+from hwp_bench.importers.official.from_release import (
+    box_of_landmarks,
+    correct_crop,
+    crop_frames,
+    official_crop,
+)
 from hwp_bench.importers.official.records import find_folders, read_records
 from hwp_bench.importers.shared.output import project_hand
 
@@ -310,6 +315,36 @@ def test_odd_but_honest_records_are_read_and_told(
             find_folders(folder)[0], tmp_path / "d", OfficialImport(mano=mano, official_compat=True)
         )
     assert not (tmp_path / "d").exists()
+
+
+@pytest.mark.parametrize("compat", [False, True])
+def test_a_box_that_no_hand_can_have_is_refused(
+    tmp_path: Path, right: HandTemplate, compat: bool
+) -> None:
+    """Oracle: three times the 400 px of the image, which a crop may have."""
+    rows = write_release(tmp_path / "capture4_subsample4", right, 3)
+
+    def crop() -> Any:
+        return crop_frames(read(tmp_path / "capture4_subsample4"), 64, compat=compat)[0][1]
+
+    def spoil(key: str, value: np.ndarray) -> None:
+        rows[1][key] = value
+        write_pickles(tmp_path / "capture4_subsample4", rows)
+
+    spoil("bbox_inter", np.array([-400, 0, 800, 300]))
+    assert crop().side == 1200
+    for edge in (1201, 1_000_000):
+        spoil("bbox_inter", np.array([-401, 0, edge - 401, 300]))
+        with pytest.raises(BadInput, match=rf"bbox_inter: frame 1: .* {edge} px large"):
+            crop()
+    if not compat:
+        rows[1].pop("bbox_inter")
+        for far in (4e5, 1e300):
+            joints = rows[1]["joints2d_world_left"].copy()
+            joints[0, 3] = far
+            spoil("joints2d_world_left", joints)
+            with pytest.raises(BadInput, match=r"00001.png: joints2d_world_left: frame 1: .*large"):
+                crop()
 
 
 def test_the_box_of_joints_is_the_releases(right: HandTemplate) -> None:
