@@ -161,13 +161,10 @@ def _print_audit(report: AuditReport) -> None:
         test, other, apart = min(report.near_duplicates, key=lambda pair: pair[2])
         near = (
             f"{len(report.near_duplicates)}; the closest: test frame {test} and frame {other}, "
-            f"RMS {apart:.2f} levels; none with a guard gap of {report.guard_needed} frames"
+            f"RMS {apart:.2f} levels; {_gap(report.guard_needed)}"
         )
     if report.same_hashes:
-        hashes = (
-            f"{len(report.same_hashes)} pairs; none with a guard gap of "
-            f"{report.guard_needed_by_hash} frames"
-        )
+        hashes = f"{len(report.same_hashes)} pairs; {_gap(report.guard_needed_by_hash)}"
     perturbed = ", ".join(f"{frame} ({name})" for frame, name in report.perturbed_test[:10])
     rows = (
         ("frames", ", ".join(f"{part} {count}" for part, count in report.counts.items())),
@@ -180,6 +177,10 @@ def _print_audit(report: AuditReport) -> None:
     )
     verdict = "fair" if report.ok else "NOT FAIR"
     print_table(named_table(f"{report.capture}: {verdict}", "question, answer", rows))
+
+
+def _gap(frames: int | None) -> str:
+    return "no gap removes them" if frames is None else f"none with a guard gap of {frames} frames"
 
 
 _GET = """examples:
