@@ -5,12 +5,12 @@ from __future__ import annotations
 import argparse
 import shlex
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hwp_bench.base.console import JobsView, notice, track
-from hwp_bench.base.errors import UsageError, shown
+from hwp_bench.base.errors import BadSplit, UsageError, shown
 from hwp_bench.base.files import check_places
 from hwp_bench.base.tables import print_table
 from hwp_bench.cli.options import (
@@ -54,15 +54,21 @@ def _add_check(parser: argparse.ArgumentParser) -> None:
 
 
 def _check(args: argparse.Namespace) -> int:
-    from hwp_bench.capture.check import check_capture
+    from hwp_bench.capture.check import Finding, check_capture
 
     if args.guard < 0 or (args.guard and args.splits):
         raise UsageError("a guard gap is at least 0, and not for a split file", field="--guard")
     splits, rows, sound = splits_of(args), [], True
     for path in track(args.captures, "checking captures"):
         report = check_capture(path)
+        audit = None
         # Frames that cannot be read cannot be compared.
-        audit = _audit(path, splits, args.guard) if report.ok else None
+        if report.ok:
+            try:
+                audit = _audit(path, splits, args.guard)
+            except BadSplit as error:
+                found = Finding("error", path, error.field, error.problem, error.remedy)
+                report = replace(report, findings=(found, *report.findings))
         sound = sound and report.ok and (audit is None or audit.ok)
         if args.json:
             split = None if audit is None else {"ok": audit.ok, **asdict(audit)}
