@@ -195,16 +195,18 @@ def test_a_calibration_is_read_and_checked(tmp_path: Path) -> None:
     found = read_calibration(path)
     assert (np.array(found.motion) == motion()).all()
     assert found.offset == 3
-    for field, value in (
-        ("first", "[[1.0, 0.0], [0.0], [0.0]]"),
-        ("second", "[[0, 0, 1], [0, 1, 1], [0, 0, 1]]"),
-        ("motion", "[[1, 0, 0, 0], [0, 2, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"),
-        ("motion", ""),
-        ("schema", '"hwp-two-cameras/2"'),
-        ("offset", "0.5"),
+    for field, value, said in (
+        ("first", "[[1.0, 0.0], [0.0], [0.0]]", "has rows of several lengths"),
+        ("second", "[[0, 0, 1], [0, 1, 1], [0, 0, 1]]", "has a focal length"),
+        ("motion", "[[1, 0, 0, 0], [0, 2, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]", "has a rotation"),
+        ("motion", "[[1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]", "has rows of several"),
+        ("motion", "[[1], [0], [0], [0]]", "has shape"),
+        ("motion", "", ""),
+        ("schema", '"hwp-two-cameras/2"', ""),
+        ("offset", "0.5", ""),
     ):
         path.write_text(text(**{field: value}))
-        with pytest.raises(BadInput):
+        with pytest.raises(BadInput, match=f"{field}: {said}"):
             read_calibration(path)
     with pytest.raises(BadInput, match="cannot be read"):
         read_calibration(tmp_path / "none.toml")
