@@ -122,6 +122,14 @@ def add_second_view(
         BadInput: what the cameras saw contradicts the calibration.
     """
     refuse_existing(first.root / FREE_VIEW, overwrite=overwrite, flag="--overwrite")
+    of_videos = [c.root for c in (first, second) if c.info.source.get("kind") == "video"]
+    if calibration is None and of_videos:
+        raise UsageError(
+            "captures of videos share no world",
+            where=of_videos[0],
+            field="--calibration",
+            remedy="Say where both cameras are with --calibration; docs/video.md describes it.",
+        )
     for name in ("hands", "width", "height"):
         values = [getattr(capture.info, name) for capture in (first, second)]
         if values[0] != values[1]:

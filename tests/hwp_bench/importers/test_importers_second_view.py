@@ -178,6 +178,14 @@ def test_what_contradicts_the_calibration_is_refused(pair: Pair, tmp_path: Path)
         add_second_view(front, bare, calibration(offset=-10), overwrite=True)
 
 
+def test_captures_of_videos_need_a_calibration(pair: Pair) -> None:
+    """Also where the second camera is so near that its own hands lie on those of the first."""
+    front, _ = pair()
+    with pytest.raises(UsageError, match="--calibration: captures of videos share no world"):
+        add_second_view(front, front)
+    assert front.free_view is None
+
+
 def text(**changes: str) -> str:
     fields = {
         "schema": '"hwp-two-cameras/1"',
