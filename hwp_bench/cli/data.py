@@ -210,8 +210,8 @@ def _add_get(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     text = "hwp: the official release; real-1: a suite of real clips"
     add("name", choices=("hwp", *REAL_SUITES), help=text)
-    out = Path("WildGHand")
-    add("-o", "--out", type=Path, default=out, metavar="DIR", help="hwp: folder to make")
+    text = "hwp: folder to make (default: WildGHand)"
+    add("-o", "--out", type=Path, metavar="DIR", help=text)
     text = "hwp: only folders whose names begin with this"
     add("--capture", **SEVERAL, metavar="NAME", help=text)
     add("--revision", help="hwp: branch, tag or commit (default: the newest)")
@@ -223,16 +223,23 @@ def _add_get(parser: argparse.ArgumentParser) -> None:
 def _get(args: argparse.Namespace) -> int:
     from hwp_bench.importers.official.download import HuggingFaceHub, download_release
 
-    if args.name in REAL_SUITES:
+    clips = args.name in REAL_SUITES
+    of_hwp = {"--out": args.out, "--capture": args.capture, "--revision": args.revision}
+    for option, given in (of_hwp if clips else {"--from": args.source}).items():
+        if given:
+            remedy = "Leave it out; `hwp-bench data get --help` says which data each option is for."
+            raise UsageError(f"is not for {args.name}", field=option, remedy=remedy)
+    if clips:
         return _get_clips(args)
-    check_places({"--out": args.out}, {})
+    out = args.out or Path("WildGHand")
+    check_places({"--out": out}, {})
     with JobsView() as jobs:
         made = download_release(
-            args.out,
+            out,
             HuggingFaceHub(),
             captures=args.capture,
             revision=args.revision,
-            update=jobs.turn(0, 1, f"downloading to {args.out}"),
+            update=jobs.turn(0, 1, f"downloading to {out}"),
         )
     for name in made.archives:
         notice(f"warning: {name} is an archive; it is left packed")
