@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,7 @@ import numpy as np
 
 from hwp_bench.base.console import progress
 from hwp_bench.base.errors import BadInput, bounded
-from hwp_bench.base.files import sha256_file
+from hwp_bench.base.files import sha256_file, sha256_json
 from hwp_bench.base.images import is_blank, read_gray, read_rgb
 from hwp_bench.capture import Cameras
 from hwp_bench.capture.schema import check_id
@@ -54,6 +54,7 @@ from hwp_bench.importers.shared.output import (
     check_choices,
     fit_free_hand,
     project_hand,
+    read_report,
     refuse_existing,
     write_capture,
 )
@@ -245,13 +246,37 @@ class OfficialImport(ReleaseImport):
         )
 
 
+def check_import(
+    folder: OfficialFolder, out: str | os.PathLike[str], options: OfficialImport
+) -> None:
+    """Refuse before minutes of work what `import_official` refuses of its arguments."""
+    check_id(folder.id, os.fspath(folder.path))
+    refuse_existing(out, overwrite=options.overwrite)
+
+
+def read_finished_import(
+    folder: OfficialFolder, out: str | os.PathLike[str], options: OfficialImport
+) -> dict[str, Any] | None:
+    """Return the facts of an import that the same call has finished; None where it has not."""
+    facts = None if options.overwrite else read_report(out)
+    return facts if facts and facts.pop("call", None) == _call(folder, options) else None
+
+
+def _call(folder: OfficialFolder, options: OfficialImport) -> str:
+    """The digest of everything that a person gives an import, but for the hand model's files."""
+    chosen = {**asdict(options), "mano": options.model, "overwrite": False}
+    files = sorted(path for path in folder.path.rglob("*") if path.is_file())
+    named = {path.relative_to(folder.path).as_posix(): sha256_file(path) for path in files}
+    return sha256_json([chosen, folder.id, folder.subsample, folder.single, named])
+
+
 def import_official(
     folder: OfficialFolder, out: str | os.PathLike[str], options: OfficialImport | None = None
 ) -> dict[str, Any]:
     """Make a capture of one folder of the release."""
     options = options or OfficialImport()
-    check_id(folder.id, os.fspath(folder.path))
-    refuse_existing(out, overwrite=options.overwrite)
+    check_import(folder, out, options)
+    call = _call(folder, options)
     records = read_records(folder)
     warnings = _unexpected(folder, records)
     sides, note = _choose_sides(folder, records, options.hand)
@@ -292,7 +317,7 @@ def import_official(
         cameras,
         ((crop.image, crop.mask) for crop in crops),
         list(clips.values()),
-        facts,
+        {**facts, "call": call},
         overwrite=options.overwrite,
         model=options.model,
         size=options.size,
@@ -399,9 +424,9 @@ def _choose_sides(
     The tracker writes both hands in every capture. Of a single-hand capture it
     is the hand whose joints lie on the masks, unless `hand` names it.
     """
-    entry = catalogue().get(folder.id)
     note: list[str] = []
     sides: tuple[str, ...] = tuple(records.sides)
+    entry = catalogue().get(folder.id)
     if not (entry.hands == "single" if entry else folder.single):
         if set(sides) != {"right", "left"}:
             raise BadInput(

@@ -4,6 +4,7 @@ route than the importer's), OpenCV's affine warp, and the released loader's arit
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -237,8 +238,32 @@ def test_without_mano_the_free_hand_is_fitted(release: Path, tmp_path: Path, cap
     facts = capture.info.source["import"]
     assert max(facts["vertex_error_mm"].values()) < 8.0
     assert min(facts["vertices_on_mask"].values()) > 0.9
-    assert main(words) == 2
+    assert main([*words, "--size", "128"]) == 2
     assert "exists already" in capsys.readouterr().err
+
+
+def test_a_folder_of_captures_is_continued(
+    release: Path, mano: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As after a kill between its captures. What cannot be written is refused before any work."""
+    out = tmp_path / "captures"
+    words = ["data", "import", "wildghand", str(release), "-o", str(out), "--mano", str(mano)]
+    assert main([*words, "--json"]) == 0
+    facts = capsys.readouterr().out
+    shutil.rmtree(out / "capture4")
+    before = (out / "capture0" / "capture.json").stat().st_mtime_ns
+    assert main([*words, "--json"]) == 0
+    told = capsys.readouterr()
+    assert f"{out / 'capture0'} is complete: the same call has made it" in told.err
+    assert (out / "capture0" / "capture.json").stat().st_mtime_ns == before
+    assert told.out == facts
+    # What another call has made, or an import without a digest, is not taken for it.
+    shutil.rmtree(out / "capture0")
+    assert main([*words, "--size", "128"]) == 2
+    (out / "capture4" / "extra" / "import.json").write_text("{}")
+    assert main(words) == 2
+    assert capsys.readouterr().err.count("capture4: exists already") == 2
+    assert not (out / "capture0").exists()
 
 
 def records_with(tmp_path: Path, right: HandTemplate, change: Any) -> Path:
