@@ -289,6 +289,9 @@ def import_official(
         warnings.append(f"frames of one colour, as black ones, are not valid: {bounded(numbers)}")
         for side, hand in hands.items():
             valid = hand.parameters.valid & ~blank
+            if not valid.any():
+                said = f"the {side} hand is in frames of one colour only"
+                raise BadInput(said, where=folder.path)
             hands[side] = replace(hand, parameters=replace(hand.parameters, valid=valid))
     cameras = Cameras(np.stack([c.K for c in crops]), np.tile(np.eye(4), (len(crops), 1, 1)))
     clips = {

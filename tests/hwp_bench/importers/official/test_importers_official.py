@@ -266,6 +266,18 @@ def test_a_folder_of_captures_is_continued(
     assert not (out / "capture0").exists()
 
 
+def test_a_hand_in_frames_of_one_colour_only_is_refused(
+    tmp_path: Path, right: HandTemplate, mano: Path
+) -> None:
+    folder = tmp_path / "capture4_subsample4"
+    write_release(folder, right, 3)
+    for image in folder.glob("0000?.png"):
+        cv2.imwrite(str(image), np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    with pytest.raises(BadInput, match="the right hand is in frames of one colour only") as caught:
+        import_official(find_folders(folder)[0], tmp_path / "c", OfficialImport(mano=mano))
+    assert caught.value.where == str(folder)
+
+
 def records_with(tmp_path: Path, right: HandTemplate, change: Any) -> Path:
     folder = tmp_path / "capture4_subsample4"
     rows = write_release(folder, right, 3)
