@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 
 from hwp_bench.base.console import progress
-from hwp_bench.base.errors import BadInput, bounded
+from hwp_bench.base.errors import BadInput, UsageError, bounded
 from hwp_bench.base.files import sha256_file, sha256_json
 from hwp_bench.base.images import is_blank, read_gray, read_rgb
 from hwp_bench.capture import Cameras
@@ -240,7 +240,7 @@ class OfficialImport(ReleaseImport):
         super().__post_init__()
         whole = not self.official_compat or self.size == 256
         check_choices(
-            ("--hand", self.hand in (None, "right", "left"), "must be right or left"),
+            ("--side", self.hand in (None, "right", "left"), "must be right or left"),
             ("--fps", 0 < self.video_fps < 1000, "must be above 0 and below 1000"),
             ("--official-compat", whole, "means frames of 256 px"),
         )
@@ -252,6 +252,13 @@ def check_import(
     """Refuse before minutes of work what `import_official` refuses of its arguments."""
     check_id(folder.id, os.fspath(folder.path))
     refuse_existing(out, overwrite=options.overwrite)
+    if options.hand is not None and not _is_single(folder):
+        raise UsageError(
+            f"{folder.id} shows two hands, and both are imported",
+            where=folder.path,
+            field="--side",
+            remedy="Leave out --side, which names the hand of a single-hand capture.",
+        )
 
 
 def read_finished_import(
@@ -419,6 +426,12 @@ def _unexpected(folder: OfficialFolder, records: OfficialRecords) -> list[str]:
     return found
 
 
+def _is_single(folder: OfficialFolder) -> bool:
+    """Whether a capture is of one hand: by the paper, or by the folder's name."""
+    entry = catalogue().get(folder.id)
+    return entry.hands == "single" if entry else folder.single
+
+
 def _choose_sides(
     folder: OfficialFolder, records: OfficialRecords, hand: str | None
 ) -> tuple[tuple[str, ...], list[str]]:
@@ -429,8 +442,7 @@ def _choose_sides(
     """
     note: list[str] = []
     sides: tuple[str, ...] = tuple(records.sides)
-    entry = catalogue().get(folder.id)
-    if not (entry.hands == "single" if entry else folder.single):
+    if not _is_single(folder):
         if set(sides) != {"right", "left"}:
             raise BadInput(
                 f"has the {', '.join(sides)} hand only, for a capture of two", where=folder.path
@@ -438,7 +450,7 @@ def _choose_sides(
         sides = ("right", "left")
     elif hand is not None:
         if hand not in sides:
-            raise BadInput(f"has no {hand} hand", where=folder.path, field="--hand")
+            raise BadInput(f"has no {hand} hand", where=folder.path, field="--side")
         sides = (hand,)
     elif len(sides) == 2:
         shares = {side: _share_on_mask(records, side) for side in sides}
@@ -449,7 +461,7 @@ def _choose_sides(
                 "the masks do not show which hand is in the image (share of joints on them: "
                 f"{listed})",
                 where=folder.path,
-                remedy="Name the hand with --hand.",
+                remedy="Name the hand with --side.",
             )
         sides, note = (side,), [f"{side} hand taken, by the share of joints on the masks: {listed}"]
     for side in sides:

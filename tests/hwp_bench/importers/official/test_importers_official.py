@@ -266,6 +266,12 @@ def test_a_folder_of_captures_is_continued(
     assert not (out / "capture0").exists()
 
 
+def test_a_side_of_two_hands_is_refused(release: Path, tmp_path: Path) -> None:
+    folder = next(f for f in find_folders(release) if f.id == "capture4")
+    with pytest.raises(UsageError, match="--side: capture4 shows two hands, and both are"):
+        import_official(folder, tmp_path / "c", OfficialImport(hand="right"))
+
+
 def test_a_hand_in_frames_of_one_colour_only_is_refused(
     tmp_path: Path, right: HandTemplate, mano: Path
 ) -> None:
@@ -423,8 +429,9 @@ def test_a_wrong_hand_model_is_noticed(release: Path, tmp_path: Path, mano: Path
 
 
 def test_options_that_make_no_sense_are_refused() -> None:
+    with pytest.raises(UsageError, match="--side: must be right or left"):
+        OfficialImport(hand="both")
     for options in (
-        {"hand": "both"},
         {"size": 8},
         {"size": 128, "official_compat": True},
         {"video_fps": 0},
