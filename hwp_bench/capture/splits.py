@@ -235,13 +235,14 @@ class AuditReport:
     unknown_severity: tuple[str, ...]
     #: Test frames that nearly equal a training or validation frame: (test, other, RMS).
     near_duplicates: tuple[tuple[int, int, float], ...]
-    #: Smallest guard gap (frames before the test clip) that leaves no near-copy.
-    guard_needed: int
+    #: Smallest guard gap (frames left out before each border) that leaves no near-copy; None where
+    #: none does, as the validation part would be empty.
+    guard_needed: int | None
     #: Test frames whose perceptual hash is that of a training or validation frame, except for a few
     #: bits: (test, other, bits that differ).
     same_hashes: tuple[tuple[int, int, int], ...]
-    #: Smallest guard gap that leaves none of them.
-    guard_needed_by_hash: int
+    #: Smallest guard gap that leaves none of them; None where none does.
+    guard_needed_by_hash: int | None
 
     @property
     def ok(self) -> bool:
@@ -282,8 +283,12 @@ def audit_split(
     )
 
 
-def _guard(split: Split, others: Iterable[int]) -> int:
-    return max((split.test_range[0] - other for other in others), default=0)
+def _guard(split: Split, others: Iterable[int]) -> int | None:
+    """The smallest gap that leaves out frames of training and validation; None where none does."""
+    first, second = split.validation_range[0], split.test_range[0]
+    borders = ((first if other < split.train_range[1] else second, other) for other in others)
+    gap = max((border - other for border, other in borders), default=0)
+    return gap if gap < second - first else None
 
 
 def _features(

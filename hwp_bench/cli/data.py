@@ -5,12 +5,12 @@ from __future__ import annotations
 import argparse
 import shlex
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hwp_bench.base.console import JobsView, notice, track
-from hwp_bench.base.errors import UsageError, shown
+from hwp_bench.base.errors import BadSplit, UsageError, shown
 from hwp_bench.base.files import check_places
 from hwp_bench.base.tables import print_table
 from hwp_bench.cli.options import (
@@ -54,15 +54,21 @@ def _add_check(parser: argparse.ArgumentParser) -> None:
 
 
 def _check(args: argparse.Namespace) -> int:
-    from hwp_bench.capture.check import check_capture
+    from hwp_bench.capture.check import Finding, check_capture
 
     if args.guard < 0 or (args.guard and args.splits):
         raise UsageError("a guard gap is at least 0, and not for a split file", field="--guard")
     splits, rows, sound = splits_of(args), [], True
     for path in track(args.captures, "checking captures"):
         report = check_capture(path)
+        audit = None
         # Frames that cannot be read cannot be compared.
-        audit = _audit(path, splits, args.guard) if report.ok else None
+        if report.ok:
+            try:
+                audit = _audit(path, splits, args.guard)
+            except BadSplit as error:
+                found = Finding("error", path, error.field, error.problem, error.remedy)
+                report = replace(report, findings=(found, *report.findings))
         sound = sound and report.ok and (audit is None or audit.ok)
         if args.json:
             split = None if audit is None else {"ok": audit.ok, **asdict(audit)}
@@ -161,13 +167,10 @@ def _print_audit(report: AuditReport) -> None:
         test, other, apart = min(report.near_duplicates, key=lambda pair: pair[2])
         near = (
             f"{len(report.near_duplicates)}; the closest: test frame {test} and frame {other}, "
-            f"RMS {apart:.2f} levels; none with a guard gap of {report.guard_needed} frames"
+            f"RMS {apart:.2f} levels; {_gap(report.guard_needed)}"
         )
     if report.same_hashes:
-        hashes = (
-            f"{len(report.same_hashes)} pairs; none with a guard gap of "
-            f"{report.guard_needed_by_hash} frames"
-        )
+        hashes = f"{len(report.same_hashes)} pairs; {_gap(report.guard_needed_by_hash)}"
     perturbed = ", ".join(f"{frame} ({name})" for frame, name in report.perturbed_test[:10])
     rows = (
         ("frames", ", ".join(f"{part} {count}" for part, count in report.counts.items())),
@@ -180,6 +183,10 @@ def _print_audit(report: AuditReport) -> None:
     )
     verdict = "fair" if report.ok else "NOT FAIR"
     print_table(named_table(f"{report.capture}: {verdict}", "question, answer", rows))
+
+
+def _gap(frames: int | None) -> str:
+    return "no gap removes them" if frames is None else f"none with a guard gap of {frames} frames"
 
 
 _GET = """examples:
@@ -203,8 +210,8 @@ def _add_get(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     text = "hwp: the official release; real-1: a suite of real clips"
     add("name", choices=("hwp", *REAL_SUITES), help=text)
-    out = Path("WildGHand")
-    add("-o", "--out", type=Path, default=out, metavar="DIR", help="hwp: folder to make")
+    text = "hwp: folder to make (default: WildGHand)"
+    add("-o", "--out", type=Path, metavar="DIR", help=text)
     text = "hwp: only folders whose names begin with this"
     add("--capture", **SEVERAL, metavar="NAME", help=text)
     add("--revision", help="hwp: branch, tag or commit (default: the newest)")
@@ -216,16 +223,23 @@ def _add_get(parser: argparse.ArgumentParser) -> None:
 def _get(args: argparse.Namespace) -> int:
     from hwp_bench.importers.official.download import HuggingFaceHub, download_release
 
-    if args.name in REAL_SUITES:
+    clips = args.name in REAL_SUITES
+    of_hwp = {"--out": args.out, "--capture": args.capture, "--revision": args.revision}
+    for option, given in (of_hwp if clips else {"--from": args.source}).items():
+        if given:
+            remedy = "Leave it out; `hwp-bench data get --help` says which data each option is for."
+            raise UsageError(f"is not for {args.name}", field=option, remedy=remedy)
+    if clips:
         return _get_clips(args)
-    check_places({"--out": args.out}, {})
+    out = args.out or Path("WildGHand")
+    check_places({"--out": out}, {})
     with JobsView() as jobs:
         made = download_release(
-            args.out,
+            out,
             HuggingFaceHub(),
             captures=args.capture,
             revision=args.revision,
-            update=jobs.turn(0, 1, f"downloading to {args.out}"),
+            update=jobs.turn(0, 1, f"downloading to {out}"),
         )
     for name in made.archives:
         notice(f"warning: {name} is an archive; it is left packed")
@@ -300,6 +314,7 @@ def _track(args: argparse.Namespace) -> int:
         settings=TrackerSettings(args.hands, min_palm_score=least, min_presence=least),
         model=args.model,
         overwrite=args.overwrite,
+        unseen=args.sheet,
     )
     if args.sheet is not None:
         from hwp_bench.base.images import write_image

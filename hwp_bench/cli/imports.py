@@ -151,8 +151,9 @@ _WILDGHAND = """examples:
   hwp-bench data import wildghand WildGHand -o compat --mano mano_v1_2/models --official-compat
 
 DIR is one folder of the release (with output.pkl), or a folder of them; then OUT gets one capture
-for each. Pickles are read without running code from them. Without --mano the free hand is fitted,
-and its error is printed in mm. docs/data.md describes every step from the download to a table.
+for each, and the same command continues an import that was interrupted. Pickles are read without
+running code from them. Without --mano the free hand is fitted, and its error is printed in mm.
+docs/data.md describes every step from the download to a table.
 """
 
 
@@ -186,6 +187,7 @@ def _add_wildghand(parser: argparse.ArgumentParser) -> None:
 
 def _wildghand(args: argparse.Namespace) -> int:
     from hwp_bench.importers.official import OfficialImport, import_official
+    from hwp_bench.importers.official.from_release import check_import, read_finished_import
     from hwp_bench.importers.official.records import find_folders
 
     _check_release_places(args)
@@ -199,10 +201,16 @@ def _wildghand(args: argparse.Namespace) -> int:
     )
     folders = find_folders(args.folder, args.id)
     several = folders[0].path != args.folder
+    outs = [args.out / folder.id if several else args.out for folder in folders]
+    done = [read_finished_import(*each, options) for each in zip(folders, outs, strict=True)]
+    for folder, out, facts in zip(folders, outs, done, strict=True):
+        if facts is None:
+            check_import(folder, out, options)
+        else:
+            notice(f"{out} is complete: the same call has made it; --overwrite imports again")
     results = []
-    for folder in folders:
-        out = args.out / folder.id if several else args.out
-        facts = import_official(folder, out, options)
+    for folder, out, finished in zip(folders, outs, done, strict=True):
+        facts = finished or import_official(folder, out, options)
         for warning in facts["warnings"]:
             notice(f"warning: {folder.path}: {warning}")
         results.append({"out": str(out), **facts})

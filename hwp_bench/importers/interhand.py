@@ -454,19 +454,27 @@ def _import_hand(
     if options.mano is None:
         # A hand is placed by its wrist and knuckles; without them it cannot be placed.
         what, valid = "joints", np.isfinite(joints[:, [0, 5, 9, 17]]).all(axis=(1, 2))
-    if not valid.any():
-        other = "left" if side == "right" else "right"
-        raise BadInput(
-            f"the {side} hand has no {what} in any frame",
-            where=root,
-            remedy=f"Import the other hand alone: --side {other}.",
-        )
-    errors = {}
+    _refuse_unseen(valid, side, what, root)
+    errors: dict[str, Any] = {}
+    points = joints
     if options.mano is not None:
         # Relative to the mean pose, each hand with its own model.
         pose = mano.pose.copy()
         pose[:, 1:] += template.mean_pose.reshape(15, 3)
-        hand, one_shape = with_one_shape(template, pose, mano.shape, mano.transl, valid)
+        annotated = pose, mano.shape, mano.transl
+        shown, _ = with_one_shape(template, *annotated, valid)
+        points = pose_parameters(template, shown).vertices.numpy()
+    far = valid & ~_near_image(points, records)
+    if far.any():
+        errors["far_frames"] = records.frames[far].tolist()
+        notice(
+            f"warning: the {side} hand is annotated far outside of the image, and counts as not "
+            f"seen, in {far.sum()} of {len(far)} frames: {bounded(errors['far_frames'])}."
+        )
+        valid = valid & ~far
+        _refuse_unseen(valid, side, f"{what} near the image", root)
+    if options.mano is not None:
+        hand, one_shape = with_one_shape(template, *annotated, valid)
         errors["one_shape_mm"] = round(float(np.nanmean(one_shape)), 3)
     else:
         pose = np.where(mano.valid[:, None, None], mano.pose, 0.0)
@@ -477,6 +485,30 @@ def _import_hand(
     known = np.isfinite(gaps).any()
     distance = round(1000.0 * float(np.nanmean(gaps)), 3) if known else None
     return hand, {**errors, "joints_mm": distance, "frames_valid": int(hand.valid.sum())}
+
+
+def _refuse_unseen(valid: np.ndarray, side: str, what: str, root: str | os.PathLike[str]) -> None:
+    """Refuse a hand that is in no frame."""
+    if not valid.any():
+        other = "left" if side == "right" else "right"
+        raise BadInput(
+            f"the {side} hand has no {what} in any frame",
+            where=root,
+            remedy=f"Import the other hand alone: --side {other}.",
+        )
+
+
+def _near_image(points: np.ndarray, records: InterHandRecords) -> np.ndarray:
+    """(F,) bool: whether points (F, P, 3) m, world, are before the camera and near the image.
+
+    As in a video, they may leave it by no more than the image's size: the windows of all frames
+    are as large as the largest hand, so that one wrong annotation would make every hand tiny. A
+    point that is NaN does not count.
+    """
+    local = (points @ records.viewmat[:3, :3].T + records.viewmat[:3, 3]) @ records.K.T
+    pixels, size = local[..., :2] / np.maximum(local[..., 2:], 1e-9), np.array(records.size)
+    near = (local[..., 2] > 0) & ((pixels > -size) & (pixels < 2 * size)).all(axis=-1)
+    return np.asarray((near | np.isnan(local[..., 2])).all(axis=1))
 
 
 def _windows(clips: list[ProjectedHand], options: InterHandImport) -> CropWindows:

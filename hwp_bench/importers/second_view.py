@@ -9,6 +9,7 @@ ray, follow from both pictures.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -69,12 +70,18 @@ def read_calibration(path: Path) -> TwoCameras:
         raise BadInput("cannot be read", where=path) from error
     value = without_schema(parse_toml(text, where=path), SCHEMA, where=path)
     found = parse_record(TwoCameras, value, where=path, error=BadInput)
-    for name in ("first", "second"):
+    K, still = np.eye(3)[None], np.eye(4)[None]
+    for name in ("first", "second", "motion"):
         try:
-            K, motion = np.array([getattr(found, name)]), np.array([found.motion])
+            matrix = np.array([getattr(found, name)])
         except ValueError as error:
             raise BadInput("has rows of several lengths", where=path, field=name) from error
-        check_cameras(K, motion, where=f"{path}, {name}")
+        camera = (K, matrix) if name == "motion" else (matrix, still)
+        try:
+            check_cameras(*camera, where=os.fspath(path))
+        except BadInput as error:
+            said = error.problem.removeprefix("frame 0 ")
+            raise BadInput(said, where=path, field=name) from error
     return found
 
 
@@ -115,6 +122,14 @@ def add_second_view(
         BadInput: what the cameras saw contradicts the calibration.
     """
     refuse_existing(first.root / FREE_VIEW, overwrite=overwrite, flag="--overwrite")
+    of_videos = [c.root for c in (first, second) if c.info.source.get("kind") == "video"]
+    if calibration is None and of_videos:
+        raise UsageError(
+            "captures of videos share no world",
+            where=of_videos[0],
+            field="--calibration",
+            remedy="Say where both cameras are with --calibration; docs/video.md describes it.",
+        )
     for name in ("hands", "width", "height"):
         values = [getattr(capture.info, name) for capture in (first, second)]
         if values[0] != values[1]:

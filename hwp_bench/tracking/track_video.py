@@ -336,6 +336,7 @@ def track_video(
     model: Path | None = None,
     overwrite: bool = False,
     networks: LiteRtNetworks | None = None,
+    unseen: Path | None = None,
 ) -> TrackedVideo:
     """Track the hands of a video and write their landmarks.
 
@@ -345,6 +346,7 @@ def track_video(
         model: file or folder of the networks; None takes the cache, or downloads them once.
         overwrite: replace an existing file.
         networks: to run in place of the model.
+        unseen: image of some frames that is written where none shows a hand.
 
     Raises:
         BadInput: video or model cannot be used.
@@ -370,10 +372,12 @@ def track_video(
     warn_of_damage(info, endings[0])
     hands = collected.hands((info.width, info.height), settings.hands)
     if hands is None:
-        shown = out.with_suffix(".jpg")
-        write_image(shown, landmark_sheet(info, collected.frames, None))
+        shown = ""
+        if unseen is not None:
+            write_image(unseen, landmark_sheet(info, collected.frames, None))
+            shown = f" ({unseen} has some of them)"
         raise NoHandSeen(
-            f"none of {collected.frames} frames shows a hand ({shown} has some of them)",
+            f"none of {collected.frames} frames shows a hand{shown}",
             where=info.path,
             remedy="The whole hand must be visible. Lower --min-score to accept less.",
         )

@@ -164,6 +164,8 @@ def write_avatar_page(job: VideoJob, avatar: WildGHandAvatar) -> None:
 
 #: Fewest frames with a hand that an avatar is made of.
 FEWEST = 12
+#: Sheet of a video that shows too few, in the job's folder `work`.
+TRACKED = "tracked.jpg"
 
 
 def _frame_count(job: VideoJob) -> int:
@@ -194,6 +196,7 @@ class TrackStage(Stage):
                 settings=TrackerSettings(),
                 model=job.options.tracker,
                 overwrite=True,
+                unseen=job.work / TRACKED,
             )
         except NoHandSeen as error:
             raise NoHandSeen(
@@ -258,7 +261,7 @@ def import_options(job: VideoJob) -> VideoImport:
     seen = {side: int(np.count_nonzero(hand.detected[::step])) for side, hand in hands.items()}
     few = [side for side, count in seen.items() if count < FEWEST]
     if few and (len(few) == len(seen) or job.options.side == "both"):
-        named, shown = f"a {few[0]} hand" if few[0] else "a hand", job.work / "tracked.jpg"
+        named, shown = f"a {few[0]} hand" if few[0] else "a hand", job.work / TRACKED
         drawn = landmark_sheet(probe(job.video), total, read_hand_tracks(job.landmarks))
         write_image(shown, drawn)
         raise BadInput(

@@ -24,15 +24,15 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hwp_bench.base.console import progress
-from hwp_bench.base.errors import BadInput, bounded
-from hwp_bench.base.files import sha256_file
+from hwp_bench.base.errors import BadInput, UsageError, bounded
+from hwp_bench.base.files import sha256_file, sha256_json
 from hwp_bench.base.images import is_blank, read_gray, read_rgb
 from hwp_bench.capture import Cameras
 from hwp_bench.capture.schema import check_id
@@ -54,6 +54,7 @@ from hwp_bench.importers.shared.output import (
     check_choices,
     fit_free_hand,
     project_hand,
+    read_report,
     refuse_existing,
     write_capture,
 )
@@ -65,6 +66,8 @@ from hwp_bench.taxonomy import catalogue
 MASK_THRESHOLD = 100
 #: The joints' box is enlarged by this, as where the release has a box.
 BOX_SCALE = 1.5
+#: Largest box, in longer edges of the image: that of a hand is wrong beyond.
+MOST_BOX = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +95,7 @@ def crop_frames(
     """
 
     def one(frame: int) -> tuple[CroppedFrame, tuple[float, float]]:
-        image = read_rgb(records.images[frame])
+        image, key = read_rgb(records.images[frame]), "bbox_inter"
         mask = read_gray(records.masks[frame], image.shape[:2])
         box = records.boxes[frame]
         if box is None and compat:
@@ -104,10 +107,23 @@ def crop_frames(
                 remedy="Import it without --official-compat.",
             )
         if box is None:
-            seen = [hand.landmarks[frame] for hand in records.sides.values() if hand.valid[frame]]
+            seen = {
+                side: hand.landmarks[frame].clip(-1e9, 1e9)
+                for side, hand in records.sides.items()
+                if hand.valid[frame]
+            }
             if not seen:
                 raise BadInput("has neither a box nor a hand", where=records.images[frame])
-            box = box_of_landmarks(np.concatenate(seen))
+            key = f"joints2d_world_{max(seen, key=lambda side: np.abs(seen[side]).max())}"
+            box = box_of_landmarks(np.concatenate(list(seen.values())))
+        edge = float(max(box[2] - box[0], box[3] - box[1]))
+        if edge > MOST_BOX * max(image.shape[:2]):
+            raise BadInput(
+                f"frame {records.numbers[frame]}: the hands' box is {edge:.0f} px large",
+                where=records.images[frame],
+                field=key,
+                remedy="Correct the record, or leave it out.",
+            )
         crop = official_crop if compat else correct_crop
         height, width = image.shape[:2]
         cropped = crop(image, mask, box, float(records.focal[frame]), size)
@@ -224,10 +240,41 @@ class OfficialImport(ReleaseImport):
         super().__post_init__()
         whole = not self.official_compat or self.size == 256
         check_choices(
-            ("--hand", self.hand in (None, "right", "left"), "must be right or left"),
+            ("--side", self.hand in (None, "right", "left"), "must be right or left"),
             ("--fps", 0 < self.video_fps < 1000, "must be above 0 and below 1000"),
             ("--official-compat", whole, "means frames of 256 px"),
         )
+
+
+def check_import(
+    folder: OfficialFolder, out: str | os.PathLike[str], options: OfficialImport
+) -> None:
+    """Refuse before minutes of work what `import_official` refuses of its arguments."""
+    check_id(folder.id, os.fspath(folder.path))
+    refuse_existing(out, overwrite=options.overwrite)
+    if options.hand is not None and not _is_single(folder):
+        raise UsageError(
+            f"{folder.id} shows two hands, and both are imported",
+            where=folder.path,
+            field="--side",
+            remedy="Leave out --side, which names the hand of a single-hand capture.",
+        )
+
+
+def read_finished_import(
+    folder: OfficialFolder, out: str | os.PathLike[str], options: OfficialImport
+) -> dict[str, Any] | None:
+    """Return the facts of an import that the same call has finished; None where it has not."""
+    facts = None if options.overwrite else read_report(out)
+    return facts if facts and facts.pop("call", None) == _call(folder, options) else None
+
+
+def _call(folder: OfficialFolder, options: OfficialImport) -> str:
+    """The digest of everything that a person gives an import, but for the hand model's files."""
+    chosen = {**asdict(options), "mano": options.model, "overwrite": False}
+    files = sorted(path for path in folder.path.rglob("*") if path.is_file())
+    named = {path.relative_to(folder.path).as_posix(): sha256_file(path) for path in files}
+    return sha256_json([chosen, folder.id, folder.subsample, folder.single, named])
 
 
 def import_official(
@@ -235,8 +282,8 @@ def import_official(
 ) -> dict[str, Any]:
     """Make a capture of one folder of the release."""
     options = options or OfficialImport()
-    check_id(folder.id, os.fspath(folder.path))
-    refuse_existing(out, overwrite=options.overwrite)
+    check_import(folder, out, options)
+    call = _call(folder, options)
     records = read_records(folder)
     warnings = _unexpected(folder, records)
     sides, note = _choose_sides(folder, records, options.hand)
@@ -249,6 +296,9 @@ def import_official(
         warnings.append(f"frames of one colour, as black ones, are not valid: {bounded(numbers)}")
         for side, hand in hands.items():
             valid = hand.parameters.valid & ~blank
+            if not valid.any():
+                said = f"the {side} hand is in frames of one colour only"
+                raise BadInput(said, where=folder.path)
             hands[side] = replace(hand, parameters=replace(hand.parameters, valid=valid))
     cameras = Cameras(np.stack([c.K for c in crops]), np.tile(np.eye(4), (len(crops), 1, 1)))
     clips = {
@@ -277,7 +327,7 @@ def import_official(
         cameras,
         ((crop.image, crop.mask) for crop in crops),
         list(clips.values()),
-        facts,
+        {**facts, "call": call},
         overwrite=options.overwrite,
         model=options.model,
         size=options.size,
@@ -376,6 +426,12 @@ def _unexpected(folder: OfficialFolder, records: OfficialRecords) -> list[str]:
     return found
 
 
+def _is_single(folder: OfficialFolder) -> bool:
+    """Whether a capture is of one hand: by the paper, or by the folder's name."""
+    entry = catalogue().get(folder.id)
+    return entry.hands == "single" if entry else folder.single
+
+
 def _choose_sides(
     folder: OfficialFolder, records: OfficialRecords, hand: str | None
 ) -> tuple[tuple[str, ...], list[str]]:
@@ -384,10 +440,9 @@ def _choose_sides(
     The tracker writes both hands in every capture. Of a single-hand capture it
     is the hand whose joints lie on the masks, unless `hand` names it.
     """
-    entry = catalogue().get(folder.id)
     note: list[str] = []
     sides: tuple[str, ...] = tuple(records.sides)
-    if not (entry.hands == "single" if entry else folder.single):
+    if not _is_single(folder):
         if set(sides) != {"right", "left"}:
             raise BadInput(
                 f"has the {', '.join(sides)} hand only, for a capture of two", where=folder.path
@@ -395,7 +450,7 @@ def _choose_sides(
         sides = ("right", "left")
     elif hand is not None:
         if hand not in sides:
-            raise BadInput(f"has no {hand} hand", where=folder.path, field="--hand")
+            raise BadInput(f"has no {hand} hand", where=folder.path, field="--side")
         sides = (hand,)
     elif len(sides) == 2:
         shares = {side: _share_on_mask(records, side) for side in sides}
@@ -406,7 +461,7 @@ def _choose_sides(
                 "the masks do not show which hand is in the image (share of joints on them: "
                 f"{listed})",
                 where=folder.path,
-                remedy="Name the hand with --hand.",
+                remedy="Name the hand with --side.",
             )
         sides, note = (side,), [f"{side} hand taken, by the share of joints on the masks: {listed}"]
     for side in sides:

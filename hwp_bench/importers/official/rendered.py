@@ -232,7 +232,8 @@ def _squared_error(path: Path, capture: Capture, frame: int) -> float:
 
 def _check_method(out: Path, name: str) -> None:
     if not (out / MANIFEST).is_file():
-        if out.is_dir() and any(out.iterdir()):
+        # An import that failed may have left the folder of the predictions.
+        if out.is_dir() and any(path.name != PREDICTIONS for path in out.iterdir()):
             raise UsageError(f"is not empty, and has no {MANIFEST}", where=out)
         return
     manifest = read_manifest(out)

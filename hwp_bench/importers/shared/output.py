@@ -16,9 +16,11 @@ import torch
 from hwp_bench.base.arrays import evenly
 from hwp_bench.base.console import progress
 from hwp_bench.base.drawing import labelled, outlined, sheet
-from hwp_bench.base.errors import UsageError
+from hwp_bench.base.errors import BadInput, UsageError
+from hwp_bench.base.files import read_json
 from hwp_bench.base.files import refuse_existing as refuse_folder
 from hwp_bench.capture import Cameras, CaptureInfo, CaptureWriter, identify_hand_model
+from hwp_bench.capture.schema import EXTRA, METADATA
 from hwp_bench.hands import HandParameters, HandTemplate, project
 from hwp_bench.hands.fitting import FitTargets, FittedHand, fit_hand
 from hwp_bench.hands.raster import draw_dots, fixed_point
@@ -72,6 +74,21 @@ class ReleaseImport:
 def refuse_existing(out: str | os.PathLike[str], *, overwrite: bool) -> None:
     """Refuse an output folder that is not empty before minutes of work, not after them."""
     refuse_folder(out, overwrite=overwrite, flag="--overwrite")
+
+
+def read_report(out: str | os.PathLike[str]) -> dict[str, Any] | None:
+    """Read the report of the import that made a capture, whole; None where there is none.
+
+    Its `call` is the digest of what the import was given, where the import keeps it.
+    """
+    report = Path(out) / EXTRA / REPORT_NAME
+    if not report.is_file() or not (Path(out) / METADATA).is_file():
+        return None
+    try:
+        facts = read_json(report)
+    except BadInput:
+        return None
+    return facts if isinstance(facts, dict) else None
 
 
 def fit_free_hand(

@@ -14,15 +14,15 @@ import numpy as np
 
 from hwp_bench.base.console import notice, progress
 from hwp_bench.base.errors import BadInput, UsageError, bounded
-from hwp_bench.base.files import atomic_write, read_json, sha256_file, sha256_json
+from hwp_bench.base.files import atomic_write, sha256_file, sha256_json
 from hwp_bench.base.images import is_blank, write_image
-from hwp_bench.capture.schema import EXTRA, METADATA, Cameras, check_id
+from hwp_bench.capture.schema import EXTRA, Cameras, check_id
 from hwp_bench.hands import HandParameters, load_template
 from hwp_bench.hands.skeleton import SIDES
 from hwp_bench.importers.shared.landmarks import Landmarks
 from hwp_bench.importers.shared.output import (
-    REPORT_NAME,
     SHEET_NAME,
+    read_report,
     refuse_existing,
     write_capture,
 )
@@ -242,16 +242,8 @@ def read_finished_import(
     A process may be killed after its capture was whole, and before its sheet was written, which is
     made up for. Code and hand model do not count. Arguments as of `import_video`.
     """
-    report = Path(out) / EXTRA / REPORT_NAME
-    if options.overwrite or not report.is_file() or not (Path(out) / METADATA).is_file():
-        return None
-    try:
-        facts = read_json(report)
-    except BadInput:
-        return None
-    if not isinstance(facts, dict) or "call" not in facts:
-        return None
-    if facts.pop("call") != _call(video, landmarks, out, options):
+    facts = None if options.overwrite else read_report(out)
+    if not facts or facts.pop("call", None) != _call(video, landmarks, out, options):
         return None
     if options.sheet is not None and not options.sheet.exists():
         atomic_write(options.sheet, (Path(out) / EXTRA / SHEET_NAME).read_bytes())

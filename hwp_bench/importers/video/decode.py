@@ -177,6 +177,12 @@ def read_times(path: str | os.PathLike[str]) -> np.ndarray | None:
     return np.asarray(times - times[0])
 
 
+def count_frames(path: str | os.PathLike[str]) -> int:
+    """Decode a video to its end and count its frames."""
+    with _opened(Path(path)) as video:
+        return sum(1 for _ in video.frames())
+
+
 @dataclass(frozen=True, eq=False)
 class ClipImages:
     """The frames of a clip at two resolutions."""
@@ -366,8 +372,13 @@ class _Video:
                 yield packet
 
     def _packets_of_file(self) -> Iterator[Any]:
-        """Packets of the video; takes note of how far those of all streams reach."""
+        """Packets of the video; takes note of how far those of all streams reach.
+
+        A last packet that is not whole is left out: its error, at the end, would take the frames
+        with it that the decoder's threads still have, so that their number would decide.
+        """
         streams, own = self._container.streams, self._stream.index
+        held = None
         others = () if self._own else (*streams.audio, *streams.video)
         wanted = [self._stream, *(one for one in others if one.index != own)]
         packets = iter(self._container.demux(wanted))
@@ -379,6 +390,7 @@ class _Video:
                 self._cut = True
                 return
             if packet is None:
+                self._cut |= held is not None
                 return
             if packet.pts is not None and packet.size:
                 end = float((packet.pts + (packet.duration or 0)) * packet.time_base)
@@ -391,7 +403,13 @@ class _Video:
             if packet.stream.index == own:
                 self._seen += packet.size > 0
                 self._damaged += bool(packet.is_corrupt)
-                yield packet
+                if held is not None and packet.size:
+                    yield held
+                    held = None
+                if packet.is_corrupt:
+                    held = packet
+                else:
+                    yield packet
 
     def _colours(self, frame: Any) -> Colours:
         stated = (frame.colorspace, frame.color_primaries, frame.color_trc, frame.color_range)

@@ -39,6 +39,7 @@ from hwp_bench.importers.video.decode import (
     FrameRange,
     Reading,
     VideoInfo,
+    count_frames,
     probe,
     read_frames,
     read_images,
@@ -166,11 +167,13 @@ def read_source(
     tracked = read_association(landmarks)
     every = read_sides(landmarks, options.side, tracked, min_score=options.min_score)
     # Containers may state a wrong number of frames. A whole video is counted as it is decoded.
-    # The end of a part is never decoded, so its packets or the header are trusted.
+    # The end of a part is not: where neither packets nor header agree with the landmarks, as of a
+    # file that is cut off, its frames are counted.
     times = read_times(info.path)
     total = len(next(iter(every.values())).score)
-    if options.frames.stop is not None and (times is None or len(times) != total):
-        total = info.stated_frames or total
+    counts = {info.stated_frames, 0 if times is None else len(times)}
+    if options.frames.stop is not None and total not in counts:
+        total = count_frames(info.path)
     checked = {
         side: check_against_video(hand, total, info.width, info.height, landmarks)
         for side, hand in every.items()

@@ -11,8 +11,9 @@ import time
 from pathlib import Path
 
 import pytest
-from small_captures import CaptureMaker
+from small_captures import CaptureMaker, split_file
 
+from hwp_bench.capture.folder import rewrite_capture
 from hwp_bench.cli.main import command_tree, main
 from hwp_bench.cli.program import Command
 
@@ -96,6 +97,37 @@ def test_check_speaks_json_of_capture_and_split(make_capture: CaptureMaker, caps
     (capture.root / "frames" / "000004.png").write_bytes(b"")
     assert main(["data", "check", str(capture.root)]) == 1
     assert "000004.png: is empty" in capsys.readouterr().out
+
+
+def test_a_capture_without_a_split_does_not_keep_others_from_being_checked(
+    make_capture: CaptureMaker, tmp_path: Path, capsys
+) -> None:
+    short, long = make_capture("short", frames=8), make_capture("long", frames=20)
+    words = ["data", "check", str(short.root), str(long.root)]
+    assert main([*words, "--json"]) == 1
+    first, second = json.loads(capsys.readouterr().out)
+    [finding] = first["findings"]
+    assert (first["ok"], first["split"], finding["level"]) == (False, None, "error")
+    assert finding["where"] == str(short.root)
+    assert finding["problem"] == "has 8 frames, too few to split 80/10/10"
+    assert second["ok"]
+    assert second["split"]["ok"]
+    splits = split_file(tmp_path / "splits.json", "short", [0, 4], 8)
+    assert main([*words, "--splits", splits]) == 1
+    out = capsys.readouterr().out
+    assert "short: fair" in out
+    assert "long: is not in the split file. The file lists: short." in out
+
+
+def test_no_gap_is_recommended_that_a_split_cannot_have(
+    make_capture: CaptureMaker, tmp_path: Path, capsys
+) -> None:
+    capture = make_capture(frames=20)
+    frames = capture.root / "frames"
+    (frames / "000018.png").write_bytes((frames / "000005.png").read_bytes())
+    rewrite_capture(capture, tmp_path / "copied", capture.info, capture.hands)
+    assert main(["data", "check", str(tmp_path / "copied")]) == 0
+    assert "no gap removes them" in " ".join(capsys.readouterr().out.split())
 
 
 def test_lists_speak_json(capsys) -> None:

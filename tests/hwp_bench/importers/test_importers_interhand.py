@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from interhand_release import FRAMES, HEIGHT, WIDTH, project, write_interhand
+from interhand_release import FRAMES, HEIGHT, WIDTH, camera, project, write_interhand
 from synthetic_mano import write_mirrored_mano
 
 from hwp_bench.base.errors import BadInput, UsageError
@@ -177,6 +177,47 @@ def test_black_images_are_named_and_left_out(
         cv2.imwrite(str(images / f"image{frame}.jpg"), black)
     with pytest.raises(BadInput, match="11 of 12 images of the sequence are black"):
         import_interhand(root, SEQUENCE, tmp_path / "d")
+
+
+@pytest.fixture(scope="module")
+def sound_crop(
+    release: tuple[Path, dict], mano: Path, tmp_path_factory: pytest.TempPathFactory
+) -> int:
+    out = tmp_path_factory.mktemp("sound") / "c"
+    options = InterHandImport(mano=mano, size=64)
+    return int(import_interhand(release[0], SEQUENCE, out, options)["crop_px"])
+
+
+@pytest.mark.parametrize(
+    ("model", "place"),
+    [("mano", "far off"), ("mano", "in the camera's plane"), ("free", "far off")],
+)
+def test_a_hand_that_is_annotated_far_outside_is_not_seen_there(
+    release: tuple[Path, dict], mano: Path, tmp_path: Path, sound_crop: int,
+    capsys: pytest.CaptureFixture[str], model: str, place: str,
+) -> None:  # fmt: skip
+    """One wrong frame of one hand. Oracle: the window of the sound annotations, within 10 %."""
+    root = copied(release[0], tmp_path)
+    options = InterHandImport(size=64, mano=mano if model == "mano" else None)
+    rotation, position = camera()
+    move = 3.0 * rotation[0] if place == "far off" else position / 1000.0
+
+    def spoil(tables: dict) -> None:
+        frame = tables["21"]["10"]
+        if model == "mano":
+            frame["right"]["trans"] = (np.array(frame["right"]["trans"]) + move).tolist()
+        else:
+            frame["world_coord"][:21] = (np.array(frame["world_coord"][:21]) + 1e3 * move).tolist()
+
+    edit(root, "MANO_NeuralAnnot" if model == "mano" else "joint_3d", spoil)
+    facts = import_interhand(root, SEQUENCE, tmp_path / "c", options)
+    said = "the right hand is annotated far outside of the image, and counts as not seen, in 1 of"
+    assert f"{said} 12 frames: 10." in capsys.readouterr().err
+    assert facts["errors"]["right"]["far_frames"] == [10]
+    assert facts["crop_px"] == pytest.approx(sound_crop, rel=0.1)
+    capture = open_capture(tmp_path / "c")
+    np.testing.assert_array_equal(capture.hands["right"].valid, np.arange(12) != 1)
+    assert check_capture(capture.root).ok
 
 
 def test_a_hand_that_is_never_annotated_is_left_out_on_request(

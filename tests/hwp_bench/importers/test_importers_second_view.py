@@ -178,6 +178,14 @@ def test_what_contradicts_the_calibration_is_refused(pair: Pair, tmp_path: Path)
         add_second_view(front, bare, calibration(offset=-10), overwrite=True)
 
 
+def test_captures_of_videos_need_a_calibration(pair: Pair) -> None:
+    """Also where the second camera is so near that its own hands lie on those of the first."""
+    front, _ = pair()
+    with pytest.raises(UsageError, match="--calibration: captures of videos share no world"):
+        add_second_view(front, front)
+    assert front.free_view is None
+
+
 def text(**changes: str) -> str:
     fields = {
         "schema": '"hwp-two-cameras/1"',
@@ -195,16 +203,18 @@ def test_a_calibration_is_read_and_checked(tmp_path: Path) -> None:
     found = read_calibration(path)
     assert (np.array(found.motion) == motion()).all()
     assert found.offset == 3
-    for field, value in (
-        ("first", "[[1.0, 0.0], [0.0], [0.0]]"),
-        ("second", "[[0, 0, 1], [0, 1, 1], [0, 0, 1]]"),
-        ("motion", "[[1, 0, 0, 0], [0, 2, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"),
-        ("motion", ""),
-        ("schema", '"hwp-two-cameras/2"'),
-        ("offset", "0.5"),
+    for field, value, said in (
+        ("first", "[[1.0, 0.0], [0.0], [0.0]]", "has rows of several lengths"),
+        ("second", "[[0, 0, 1], [0, 1, 1], [0, 0, 1]]", "has a focal length"),
+        ("motion", "[[1, 0, 0, 0], [0, 2, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]", "has a rotation"),
+        ("motion", "[[1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]", "has rows of several"),
+        ("motion", "[[1], [0], [0], [0]]", "has shape"),
+        ("motion", "", ""),
+        ("schema", '"hwp-two-cameras/2"', ""),
+        ("offset", "0.5", ""),
     ):
         path.write_text(text(**{field: value}))
-        with pytest.raises(BadInput):
+        with pytest.raises(BadInput, match=f"{field}: {said}"):
             read_calibration(path)
     with pytest.raises(BadInput, match="cannot be read"):
         read_calibration(tmp_path / "none.toml")

@@ -18,6 +18,7 @@ from hwp_bench.base.errors import BadInput
 from hwp_bench.cli.main import main
 from hwp_bench.importers.shared.landmarks import read_association, read_hand_tracks, read_landmarks
 from hwp_bench.tracking import track_video
+from hwp_bench.tracking.track_video import NoHandSeen
 
 
 def write_video(path: Path, clip: list[dict[str, tuple[float, float]]]) -> Path:
@@ -99,6 +100,21 @@ def test_the_command(
     assert "none of 3 frames shows a hand" in said
     assert "Traceback" not in said
     assert not empty.with_suffix(".npz").exists()
+
+
+def test_a_sheet_without_hands_is_written_only_where_it_is_asked_for(tmp_path: Path) -> None:
+    """A photo of the video's name next to it stays as it is."""
+    empty = write_video(tmp_path / "hand.avi", [{}] * 3)
+    photo = tmp_path / "hand.jpg"
+    photo.write_bytes(b"mine")
+    with pytest.raises(NoHandSeen, match=r"a hand\. The"):
+        track_video(empty, tmp_path / "hand.npz", networks=FakeNetworks())
+    assert {path.name for path in tmp_path.iterdir()} == {"hand.avi", "hand.jpg"}
+    assert photo.read_bytes() == b"mine"
+    sheet = tmp_path / "sheet.jpg"
+    with pytest.raises(NoHandSeen, match=r"sheet\.jpg has some"):
+        track_video(empty, tmp_path / "hand.npz", networks=FakeNetworks(), unseen=sheet)
+    assert sheet.stat().st_size > 1000
 
 
 def test_a_video_that_ends_early_is_tracked_and_said(

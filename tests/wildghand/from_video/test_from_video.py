@@ -421,7 +421,7 @@ def test_a_video_without_a_hand(tmp_path: Path, capsys) -> None:
     assert main(["fit", str(tmp_path / "wall.avi")]) == 1
     told = capsys.readouterr().err
     assert "none of 3 frames shows a hand" in told
-    assert (tmp_path / "wall_avatar" / "work" / "landmarks.jpg").is_file()
+    assert (tmp_path / "wall_avatar" / "work" / "tracked.jpg").is_file()
     assert "--landmarks" in told
 
 

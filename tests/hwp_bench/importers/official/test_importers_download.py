@@ -172,6 +172,22 @@ def test_the_command_uses_the_hubs_own_client(tmp_path: Path, monkeypatch, capsy
     assert json.loads(capsys.readouterr().out)["kept"] == 4
 
 
+@pytest.mark.parametrize(
+    "words",
+    [("real-1", "--out", "x"), ("real-1", "--capture", "capture0_"), ("real-1", "--revision", "v1"),
+     ("hwp", "--from", "x")],
+)  # fmt: skip
+def test_options_of_the_other_data_set_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys, words: tuple[str, ...]
+) -> None:
+    calls = fake_package(monkeypatch)
+    monkeypatch.chdir(tmp_path)
+    assert main(["data", "get", *words]) == 2
+    assert f"{words[1]}: is not for {words[0]}" in capsys.readouterr().err
+    assert not calls
+    assert not list(tmp_path.iterdir())
+
+
 def test_without_the_package_the_message_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
     with pytest.raises(MissingDependency, match="pip install"):

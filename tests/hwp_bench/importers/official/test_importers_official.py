@@ -4,6 +4,7 @@ route than the importer's), OpenCV's affine warp, and the released loader's arit
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,12 @@ from hwp_bench.capture.splits import contiguous_split, split_for
 from hwp_bench.cli.main import main
 from hwp_bench.hands import HandTemplate, load_template, pose_hand
 from hwp_bench.importers.official import OfficialImport, import_official
-from hwp_bench.importers.official.from_release import box_of_landmarks, correct_crop, official_crop
+from hwp_bench.importers.official.from_release import (
+    box_of_landmarks,
+    correct_crop,
+    crop_frames,
+    official_crop,
+)
 from hwp_bench.importers.official.records import find_folders, read_records
 from hwp_bench.importers.shared.output import project_hand
 
@@ -232,8 +238,50 @@ def test_without_mano_the_free_hand_is_fitted(release: Path, tmp_path: Path, cap
     facts = capture.info.source["import"]
     assert max(facts["vertex_error_mm"].values()) < 8.0
     assert min(facts["vertices_on_mask"].values()) > 0.9
-    assert main(words) == 2
+    assert main([*words, "--size", "128"]) == 2
     assert "exists already" in capsys.readouterr().err
+
+
+def test_a_folder_of_captures_is_continued(
+    release: Path, mano: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As after a kill between its captures. What cannot be written is refused before any work."""
+    out = tmp_path / "captures"
+    words = ["data", "import", "wildghand", str(release), "-o", str(out), "--mano", str(mano)]
+    assert main([*words, "--json"]) == 0
+    facts = capsys.readouterr().out
+    shutil.rmtree(out / "capture4")
+    before = (out / "capture0" / "capture.json").stat().st_mtime_ns
+    assert main([*words, "--json"]) == 0
+    told = capsys.readouterr()
+    assert f"{out / 'capture0'} is complete: the same call has made it" in told.err
+    assert (out / "capture0" / "capture.json").stat().st_mtime_ns == before
+    assert told.out == facts
+    # What another call has made, or an import without a digest, is not taken for it.
+    shutil.rmtree(out / "capture0")
+    assert main([*words, "--size", "128"]) == 2
+    (out / "capture4" / "extra" / "import.json").write_text("{}")
+    assert main(words) == 2
+    assert capsys.readouterr().err.count("capture4: exists already") == 2
+    assert not (out / "capture0").exists()
+
+
+def test_a_side_of_two_hands_is_refused(release: Path, tmp_path: Path) -> None:
+    folder = next(f for f in find_folders(release) if f.id == "capture4")
+    with pytest.raises(UsageError, match="--side: capture4 shows two hands, and both are"):
+        import_official(folder, tmp_path / "c", OfficialImport(hand="right"))
+
+
+def test_a_hand_in_frames_of_one_colour_only_is_refused(
+    tmp_path: Path, right: HandTemplate, mano: Path
+) -> None:
+    folder = tmp_path / "capture4_subsample4"
+    write_release(folder, right, 3)
+    for image in folder.glob("0000?.png"):
+        cv2.imwrite(str(image), np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    with pytest.raises(BadInput, match="the right hand is in frames of one colour only") as caught:
+        import_official(find_folders(folder)[0], tmp_path / "c", OfficialImport(mano=mano))
+    assert caught.value.where == str(folder)
 
 
 def records_with(tmp_path: Path, right: HandTemplate, change: Any) -> Path:
@@ -312,6 +360,36 @@ def test_odd_but_honest_records_are_read_and_told(
     assert not (tmp_path / "d").exists()
 
 
+@pytest.mark.parametrize("compat", [False, True])
+def test_a_box_that_no_hand_can_have_is_refused(
+    tmp_path: Path, right: HandTemplate, compat: bool
+) -> None:
+    """Oracle: three times the 400 px of the image, which a crop may have."""
+    rows = write_release(tmp_path / "capture4_subsample4", right, 3)
+
+    def crop() -> Any:
+        return crop_frames(read(tmp_path / "capture4_subsample4"), 64, compat=compat)[0][1]
+
+    def spoil(key: str, value: np.ndarray) -> None:
+        rows[1][key] = value
+        write_pickles(tmp_path / "capture4_subsample4", rows)
+
+    spoil("bbox_inter", np.array([-400, 0, 800, 300]))
+    assert crop().side == 1200
+    for edge in (1201, 1_000_000):
+        spoil("bbox_inter", np.array([-401, 0, edge - 401, 300]))
+        with pytest.raises(BadInput, match=rf"bbox_inter: frame 1: .* {edge} px large"):
+            crop()
+    if not compat:
+        rows[1].pop("bbox_inter")
+        for far in (4e5, 1e300):
+            joints = rows[1]["joints2d_world_left"].copy()
+            joints[0, 3] = far
+            spoil("joints2d_world_left", joints)
+            with pytest.raises(BadInput, match=r"00001.png: joints2d_world_left: frame 1: .*large"):
+                crop()
+
+
 def test_the_box_of_joints_is_the_releases(right: HandTemplate) -> None:
     for row in official_rows(right, 3):
         both = np.concatenate([row["joints2d_world_right"][0], row["joints2d_world_left"][0]])
@@ -351,8 +429,9 @@ def test_a_wrong_hand_model_is_noticed(release: Path, tmp_path: Path, mano: Path
 
 
 def test_options_that_make_no_sense_are_refused() -> None:
+    with pytest.raises(UsageError, match="--side: must be right or left"):
+        OfficialImport(hand="both")
     for options in (
-        {"hand": "both"},
         {"size": 8},
         {"size": 128, "official_compat": True},
         {"video_fps": 0},

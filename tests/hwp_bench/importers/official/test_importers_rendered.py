@@ -177,5 +177,8 @@ def test_drawings_of_another_size_are_refused(
     said = capsys.readouterr().err
     assert "is 64x64 pixels where 48x48 is expected" in said
     assert "Wanted are frames 18 to 19" in said
+    # The same command takes the right ones.
+    write_rendered(tmp_path / "right", capture, TEST)
+    assert take(tmp_path / "right", capture, tmp_path / "out") == 0
     assert take(tmp_path / "nothing", capture, tmp_path / "out") != 0
     assert "is not a folder" in capsys.readouterr().err

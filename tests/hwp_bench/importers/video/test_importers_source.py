@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from encoded_video import write_pictures
 from synthetic_clip import (
     HEIGHT,
     WIDTH,
@@ -25,6 +26,7 @@ from hwp_bench.cli.main import main
 from hwp_bench.importers.shared.landmarks import HandTracks, write_hand_tracks
 from hwp_bench.importers.video import VideoImport, import_video
 from hwp_bench.importers.video import api as pipeline
+from hwp_bench.importers.video.decode import FrameRange, probe, read_frames, read_times
 from hwp_bench.importers.video.source import (
     VideoSource,
     landmark_doubts,
@@ -108,6 +110,28 @@ def test_landmarks_of_different_frames_are_told(source: VideoSource) -> None:
     hand = replace(source.landmarks, world=source.landmarks.world @ turns)
     said = landmark_doubts(replace(source, hands={"right": hand}))
     assert said == ("`image` and `world` do not show the same hand in the same frames",)
+
+
+def test_a_part_of_a_video_that_is_cut_off_is_imported(clip: SyntheticClip, tmp_path: Path) -> None:
+    """Its frames are fewer than its packets and its header say. Oracle: decoding them."""
+    images = [clip.picture(frame) for frame in range(FRAMES)]
+    whole = write_pictures(
+        tmp_path / "whole.mp4", images, container_options={"movflags": "faststart"}
+    )
+    cut = tmp_path / "cut.mp4"
+    cut.write_bytes(whole.read_bytes()[: int(0.7 * whole.stat().st_size)])
+    info, stamps = probe(cut), read_times(cut)
+    count = sum(1 for _ in read_frames(info, FrameRange()))
+    assert stamps is not None
+    assert 10 < count < len(stamps) < info.stated_frames
+    options = VideoImport(frames=FrameRange(2, 9))
+    tracked = write_landmarks(tmp_path / "a.npz", clip.landmarks.select(np.arange(count)))
+    source = read_source(cut, tracked, options)
+    assert source.indices.tolist() == list(range(2, 9))
+    assert source.images.frames.any(axis=(1, 2, 3)).all()
+    other = write_landmarks(tmp_path / "b.npz", clip.landmarks.select(np.arange(count - 1)))
+    with pytest.raises(BadInput, match=f"has {count - 1} frames, the video has {count}"):
+        read_source(cut, other, options)
 
 
 @pytest.mark.parametrize("moved", [0.0, 0.5])

@@ -11,6 +11,7 @@ import socket
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,6 +21,7 @@ from encoded_video import pictures, silence, write_pictures
 from hwp_bench.base.errors import BadInput
 from hwp_bench.base.images import read_gray
 from hwp_bench.cli.main import main
+from hwp_bench.importers.video import decode
 from hwp_bench.importers.video.decode import (
     FrameRange,
     Reading,
@@ -312,6 +314,32 @@ def test_a_video_that_ends_early_says_so(
     said = reading.warning() or ""
     assert said.startswith(f"ends early, after {len(frames)} ")
     assert count in said
+
+
+@pytest.mark.parametrize(("ending", "options"), [("mp4", FIRST), ("flv", {})])
+def test_threads_do_not_decide_how_many_frames_of_a_cut_video_are_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ending: str, options: dict[str, str]
+) -> None:
+    """Oracle: all packets but the last, of which the file has a part, and one thread's pixels."""
+    whole = tmp_path / f"a.{ending}"
+    path = cut(write_pictures(whole, pictures(COUNT), container_options=options))
+    stamps = read_times(path)
+    assert stamps is not None
+    choose, found = decode._choose, []
+    for threads in (1, 2, 4):
+
+        def chosen(container: Any, where: Path, threads: int = threads) -> Any:
+            stream = choose(container, where)
+            stream.codec_context.thread_count = threads
+            return stream
+
+        monkeypatch.setattr(decode, "_choose", chosen)
+        _, frames, reading = read(path)
+        assert len(frames) == len(stamps) - 1
+        assert reading.ends_early
+        found.append(frames)
+    for other in found[1:]:
+        np.testing.assert_array_equal(other, found[0])
 
 
 def test_a_transport_stream_that_ends_between_packets(tmp_path: Path) -> None:
