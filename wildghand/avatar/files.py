@@ -23,7 +23,7 @@ import torch
 from msgspec import Meta
 
 from hwp_bench.base.errors import BadInput, HwpError, place, shown
-from hwp_bench.base.files import atomic_folder, read_json, write_json
+from hwp_bench.base.files import atomic_folder, read_json, refuse_other, write_json
 from hwp_bench.base.images import read_gray, write_image
 from hwp_bench.base.records import Seed, parse_record
 from hwp_bench.capture.schema import SIDES, HandModelId
@@ -156,6 +156,11 @@ class _Description:
     ) = None
 
 
+def refuse_no_avatar(path: str | os.PathLike[str]) -> None:
+    """Refuse the place of an avatar where something else is."""
+    refuse_other(path, "an avatar", lambda folder: (folder / DESCRIPTION).is_file())
+
+
 def save_avatar(
     avatar: WildGHandAvatar,
     path: str | os.PathLike[str],
@@ -168,7 +173,7 @@ def save_avatar(
     Args:
         avatar: the avatar.
         path: the folder to make.
-        overwrite: replace an existing folder.
+        overwrite: replace an existing avatar.
         call: digest of the call that makes it, by which a second one knows that it is complete.
 
     Raises:
@@ -188,6 +193,7 @@ def save_avatar(
         fit=avatar.record,
         tensors=sorted(tensors),
     )
+    refuse_no_avatar(path)
     with atomic_folder(path, overwrite=overwrite, flag="--overwrite") as folder:
         # Not `save_file`, which makes a file that only its owner may read.
         data = save({name: value.detach().cpu().contiguous() for name, value in tensors.items()})

@@ -29,7 +29,7 @@ from wildghand.gaussians.fit_loop import Loss, batches
 from wildghand.model.settings import WildGHandSettings, read_settings
 from wildghand.network import PredictionNetwork
 from wildghand.plain.loop import IterativeFit
-from wildghand.prior.prior import MAPS, Prior, mean_weights, save_prior
+from wildghand.prior.prior import MAPS, Prior, mean_weights, refuse_no_prior, save_prior
 from wildghand.splat.threads import denormals_flushed
 
 # Children of a network that belong to its subject.
@@ -56,6 +56,7 @@ def pretrain(
     Args:
         steps: optimizer steps over all captures; None: the settings' number for each capture.
     """
+    refuse_no_prior(out)
     if out.exists() and not overwrite:
         raise UsageError("exists", where=out, remedy="Choose another name, or give --overwrite.")
     # A new prior starts from neither the one that ships nor one person's colours, and knows light
