@@ -269,10 +269,12 @@ def load_avatar(
         problem = str(error).splitlines()[0][:300]
         raise BadInput(f"does not hold this avatar's tensors ({problem})", where=file) from error
     betas = {side: np.array(given) for side, given in value.betas.items()}
+    # What draws the avatar loads the hand model again.
+    hand_model = dataclasses.replace(value.hand_model, source=hand or value.hand_model.source)
     avatar = WildGHandAvatar(
         model.eval(),
         settings,
-        value.hand_model,
+        hand_model,
         betas,
         mean_color,
         value.seed,
