@@ -91,9 +91,10 @@ class _Clock:
         return time.perf_counter() - self._start
 
 
-def unfinished(out: Path) -> Path:
-    """Return the folder of the state of a fit to an avatar folder, until it is finished."""
-    return out.with_name(out.name + ".fit")
+def unfinished(out: Path, ending: str = ".fit") -> Path:
+    """Return the folder of the state of a fit to an output folder, until it is finished."""
+    named = Path(os.path.abspath(out))  # A folder may be given as `.`, which is no name.
+    return named.with_name(named.name + ending)
 
 
 @denormals_flushed()

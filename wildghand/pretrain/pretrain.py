@@ -24,7 +24,13 @@ from hwp_bench.methods.request import open_request, write_request
 from wildghand.fitting.components import make_fit
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.method import ready_fit
-from wildghand.fitting.session import STATE, digest_of_request, every_frame, run_resumed
+from wildghand.fitting.session import (
+    STATE,
+    digest_of_request,
+    every_frame,
+    run_resumed,
+    unfinished,
+)
 from wildghand.gaussians.fit_loop import Loss, batches
 from wildghand.model.settings import WildGHandSettings, read_settings
 from wildghand.network import PredictionNetwork
@@ -72,7 +78,7 @@ def pretrain(
     _check_captures(captures)
     chosen = read_settings(settings)
     run = RunSettings(dict(settings), seed, Budget(steps=steps))
-    work = out.with_name(out.name + ".pretrain")
+    work = unfinished(out, ".pretrain")
     with exclusive(work):
         weights, done = _fit_in(work, captures, run, chosen)
         prior = save_prior(
