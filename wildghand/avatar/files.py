@@ -298,6 +298,26 @@ def _check_description(value: _Description) -> None:
                 field=f"betas.{side}",
                 remedy=_ANOTHER_COPY,
             )
+    _check_record(value.fit, value.sides)
+
+
+def _check_record(fit: FitRecord, sides: Sequence[str]) -> None:
+    """Check that what is said of the fitted frames is said of each of them, once."""
+    others = sorted(fit.temporal.keys() - set(sides))
+    if others:
+        problem = f"names {shown(others[0])[:40]!r}, which is not a hand of the avatar"
+        raise BadInput(problem, field="fit.temporal", remedy=_ANOTHER_COPY)
+    count = len(fit.frames)
+    if len(set(fit.frames)) < count:
+        raise BadInput("names a frame twice", field="fit.frames", remedy=_ANOTHER_COPY)
+    lengths = {f"temporal.{side}": len(values) for side, values in fit.temporal.items()}
+    # These may be empty.
+    lengths["clean"] = len(fit.clean) or count
+    lengths["frame_weights"] = len(fit.frame_weights) or count
+    for name, length in lengths.items():
+        if length != count:
+            problem = f"has {length} numbers where {count} frames were fitted"
+            raise BadInput(problem, field=f"fit.{name}", remedy=_ANOTHER_COPY)
 
 
 def _templates(
