@@ -28,7 +28,7 @@ from hwp_bench.methods.contract import Budget, HandPose
 from hwp_bench.tracking import TrackerSettings, track_video
 from hwp_bench.tracking.track_video import NoHandSeen, landmark_sheet
 from wildghand.avatar.avatar import WildGHandAvatar
-from wildghand.avatar.files import DESCRIPTION, MODEL, WEIGHTS, load_avatar
+from wildghand.avatar.files import CALL, DESCRIPTION, MODEL, WEIGHTS, load_avatar
 from wildghand.avatar.studio import REST, Pose
 from wildghand.fitting.session import fit_capture, unfinished
 from wildghand.from_video.run import Stage, VideoJob
@@ -328,7 +328,8 @@ class Place(Stage):
 
     def run(self, job: VideoJob) -> None:
         try:
-            (job.folder / DESCRIPTION).unlink(missing_ok=True)
+            for name in (DESCRIPTION, CALL):  # The call is that of another avatar.
+                (job.folder / name).unlink(missing_ok=True)
             shutil.rmtree(job.folder / WEIGHTS, ignore_errors=True)
             if (job.fitted / WEIGHTS).is_dir():
                 shutil.copytree(job.fitted / WEIGHTS, job.folder / WEIGHTS)
