@@ -53,8 +53,10 @@ VIDEO: Mapping[str, Any] = MappingProxyType(
         "schedule": {"steps": 400},
     }
 )
-#: What `quick` changes of the method's settings: fewer Gaussians, fewer steps.
-QUICK: Mapping[str, Any] = MappingProxyType({"gaussians": 5000, "schedule": {"steps": 250}})
+#: What `quick` changes of the method's settings: fewer Gaussians, fewer steps, in every mode.
+QUICK: Mapping[str, Any] = MappingProxyType(
+    {"gaussians": 5000, "schedule": {"steps": 250, "epochs": 0}}
+)
 
 
 @dataclass(frozen=True)

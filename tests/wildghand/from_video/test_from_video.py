@@ -490,6 +490,11 @@ def test_quick_takes_fewer_frames_and_smaller_fits() -> None:
     video, hurried = (read_settings(VideoFit(quick=q).method_settings()) for q in (False, True))
     assert hurried.schedule == quick.schedule  # not the video's, which are more
     assert quick.schedule.steps < video.schedule.steps < read_settings({}).schedule.steps
+    # A mode that counts epochs is hurried too, unless a person names a number of them.
+    paper = VideoFit(quick=True, settings={"mode": "paper"}).method_settings()
+    assert (read_settings(paper).schedule.steps, read_settings(paper).schedule.epochs) == (250, 0)
+    paper = with_quick({"mode": "paper", "schedule.epochs": 3}, quick=True)
+    assert read_settings(paper).schedule.epochs == 3
     # What a person says wins, in either form.
     for said in ({"schedule.steps": 5}, {"schedule": {"steps": 5}}):
         chosen = read_settings(with_quick(said, quick=True))
