@@ -154,11 +154,12 @@ def _check_folder(job: VideoJob, *, overwrite: bool) -> None:
     ours = job.record.is_file() or [path.name for path in folder.iterdir()] == [job.work.name]
     if ours or (overwrite and (folder / DESCRIPTION).is_file()):
         return
-    raise UsageError(
-        "exists and is not the folder of an avatar that was made of a video",
-        where=folder,
-        remedy="Choose another name, or delete it.",
-    )
+    problem = "exists and is not the folder of an avatar that was made of a video"
+    remedy = "Choose another name, or delete it."
+    if (folder / DESCRIPTION).is_file():
+        problem = "holds an avatar whose folder work is gone, or that was made of a capture"
+        remedy = "Choose another name, or give --overwrite to make it again."
+    raise UsageError(problem, where=folder, remedy=remedy)
 
 
 # Bytes of a job, for each stored pixel and for all the rest: on the disk, and in memory, where the

@@ -4,7 +4,8 @@ my_hand/                    an avatar folder: avatar.json, model.safetensors, we
 my_hand/turntable.mp4       the avatar turned around
 my_hand/sheet.jpg           frames, the avatar in their poses, its weights, and all sides
 my_hand/avatar.html         a page that turns and poses the avatar
-my_hand/work                can be deleted once the avatar pleases; a second run then begins again
+my_hand/work                can be deleted once the avatar pleases; without it a second run needs
+                            --overwrite, and makes everything again
     landmarks.npz           the tracked hands
     capture/                the imported capture
     avatar/, avatar.fit/    the finished fit; the state of one that continues
