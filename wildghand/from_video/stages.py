@@ -26,6 +26,7 @@ from hwp_bench.importers.video.api import IMPORTER_VERSION
 from hwp_bench.importers.video.decode import probe
 from hwp_bench.methods.contract import Budget, HandPose
 from hwp_bench.tracking import TrackerSettings, track_video
+from hwp_bench.tracking.networks import load_models
 from hwp_bench.tracking.track_video import NoHandSeen, landmark_sheet
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import CALL, DESCRIPTION, MODEL, WEIGHTS, load_avatar
@@ -181,7 +182,7 @@ class TrackStage(Stage):
         if given is not None:
             check_is_file(given, field="--landmarks")
             return {"landmarks": sha256_of(given)}
-        tracker = "shipped" if model is None else str(model)
+        tracker = "shipped" if model is None else load_models(model).digest
         return {"video": sha256_of(job.video), "tracker": tracker}
 
     def run(self, job: VideoJob) -> None:
