@@ -100,6 +100,11 @@ class VideoFit:
             ("--steps", self.steps is None or self.steps >= 1, "must be 1 or more"),
             ("--budget", self.seconds is None or self.seconds > 0.0, "must be more than 0"),
             ("--seed", self.seed >= 0, "must be 0 or more"),
+            (
+                "--model",
+                self.landmarks is None or self.tracker is None,
+                "is for tracking, and --landmarks names hands that are tracked already",
+            ),
         )
 
     @property
