@@ -32,6 +32,7 @@ from wildghand.from_video.run import (
     VideoFit,
     VideoJob,
     run_stages,
+    stride,
     with_quick,
 )
 from wildghand.from_video.stages import STAGES
@@ -174,7 +175,8 @@ def _check_requirements(job: VideoJob) -> None:
     check_encoder()
     if job.options.landmarks is None and not job.landmarks.is_file():
         LiteRtNetworks(load_models(job.options.tracker))
-    frames = min(info.stated_frames or FRAMES, job.options.most_frames)
+    count = info.stated_frames or FRAMES
+    frames = -(-count // stride(count, job.options.most_frames))
     pixels = frames * job.options.size**2
     place = next(one for one in (job.folder, *job.folder.absolute().parents) if one.is_dir())
     left = {

@@ -40,8 +40,8 @@ from wildghand.fitting.parallel import SINGLE_PROCESS, World
 from wildghand.fitting.session import Watch
 from wildghand.model.settings import nested
 
-#: Most frames that are imported, spread over the video, by default and with `quick`: 20 s at 15
-#: frames a second, and a third of that. Neighbours show the same.
+#: About how many frames are imported of a longer video, by default and with `quick`: 20 s at 15
+#: frames a second, and a third of that. Neighbours show the same. See `stride`.
 FRAMES, QUICK_FRAMES = 300, 100
 #: What the avatar of a video has in place of the method's settings: no Gaussians so wide that they
 #: draw a rim outside of the hand, which a score hardly sees and a person does; opacities that are
@@ -109,7 +109,7 @@ class VideoFit:
 
     @property
     def most_frames(self) -> int:
-        """Most frames that are imported."""
+        """About how many frames are imported of a longer video."""
         return QUICK_FRAMES if self.quick else FRAMES
 
     def method_settings(self) -> dict[str, Any]:
@@ -120,6 +120,15 @@ class VideoFit:
 def with_quick(settings: Mapping[str, Any], *, quick: bool) -> dict[str, Any]:
     """Return settings of the method; if `quick`, with `QUICK` in place of what they leave out."""
     return merged(QUICK, nested(settings)) if quick else dict(settings)
+
+
+def stride(count: int, most: int) -> int:
+    """Return the distance between imported frames.
+
+    It is the nearest whole number to `count / most`: less than half more than `most` frames are
+    imported of `count`.
+    """
+    return max(1, round(count / most))
 
 
 class VideoJob:

@@ -32,7 +32,7 @@ from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import CALL, DESCRIPTION, MODEL, WEIGHTS, load_avatar
 from wildghand.avatar.studio import REST, Pose
 from wildghand.fitting.session import fit_capture, unfinished
-from wildghand.from_video.run import Stage, VideoJob
+from wildghand.from_video.run import Stage, VideoJob, stride
 from wildghand.from_video.verdict import judge_avatar, read_verdict
 from wildghand.model.settings import read_settings
 from wildghand.page import write_page
@@ -234,11 +234,6 @@ class Import(Stage):
         # A frame takes 0.3 s, one that is decoded only 5 ms.
         count = _frame_count(job)
         return 0.3 * (count / stride(count, job.options.most_frames)) + 0.005 * count
-
-
-def stride(count: int, most: int) -> int:
-    """Return the distance between imported frames: `count` frames become about `most` or fewer."""
-    return max(1, round(count / most))
 
 
 def import_options(job: VideoJob) -> VideoImport:

@@ -33,9 +33,9 @@ from wildghand.avatar.files import CALL, load_avatar
 from wildghand.cli.main import main
 from wildghand.from_video import VideoFit, make, make_avatar, stages
 from wildghand.from_video.run import QUICK as QUICK_CHANGES
-from wildghand.from_video.run import QUICK_FRAMES, VideoJob, with_quick
+from wildghand.from_video.run import QUICK_FRAMES, VideoJob, stride, with_quick
 from wildghand.from_video.run import VIDEO as VIDEO_CHANGES
-from wildghand.from_video.stages import STAGES, import_options, stride
+from wildghand.from_video.stages import STAGES, Place, import_options
 from wildghand.model.settings import read_settings
 
 pytestmark = pytest.mark.slow
