@@ -12,7 +12,7 @@ import re
 import secrets
 import shutil
 import stat
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -123,8 +123,30 @@ def refuse_existing(
 ) -> None:
     """Refuse to make a folder where something is; `flag` is the option that replaces it."""
     path = Path(path)
-    if path.is_file() or (path.is_dir() and any(path.iterdir()) and not overwrite):
+    if path.is_file():
+        raise _exists(path, "")  # A folder does not replace a file.
+    if path.is_dir() and any(path.iterdir()) and not overwrite:
         raise _exists(path, flag)
+
+
+def refuse_other(path: str | os.PathLike[str], what: str, is_one: Callable[[Path], bool]) -> None:
+    """Refuse to put a folder in the place of a file, or of a folder with something else.
+
+    An option that replaces would delete what nobody can make again.
+
+    Args:
+        what: what the folder is, in the words of the message.
+        is_one: whether a folder that is not empty is one.
+    """
+    path = Path(path)
+    if path.is_file():
+        raise UsageError("is a file", where=path, remedy="Name a folder.")
+    if path.is_dir() and any(path.iterdir()) and not is_one(path):
+        raise UsageError(
+            f"is a folder with something else than {what}",
+            where=path,
+            remedy="Choose another name, or delete it.",
+        )
 
 
 def check_places(

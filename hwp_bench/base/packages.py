@@ -10,7 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from hwp_bench.base.errors import HwpError, MissingDependency
+from hwp_bench.base.errors import HwpError, MissingDependency, one_line
 
 __version__ = "0.1.0"
 
@@ -38,12 +38,17 @@ def import_extra(module: str, extra: str, problem: str) -> Any:
     """Import a module that an extra of the toolkit brings.
 
     Raises:
-        MissingDependency: it is not installed; `problem` says so.
+        MissingDependency: it is not installed, as `problem` says, or fails when it is imported.
     """
     try:
         return import_module(module)
     except ImportError as error:
-        remedy = f"pip install 'hwp-bench[{extra}]'"
+        package, remedy = module.partition(".")[0], f"pip install 'hwp-bench[{extra}]'"
+        absent = error.name if isinstance(error, ModuleNotFoundError) else None
+        if absent is None or absent.partition(".")[0] != package:
+            reason = one_line(str(error) or type(error).__name__, 300)
+            problem = f"{package} is installed and cannot be imported ({reason})"
+            remedy = f"Repair it, or what it needs: {remedy}"
         raise MissingDependency(problem, remedy=remedy) from error
 
 

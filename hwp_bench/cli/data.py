@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from hwp_bench.base.console import JobsView, notice, track
 from hwp_bench.base.errors import BadSplit, UsageError, shown
-from hwp_bench.base.files import check_places
+from hwp_bench.base.files import check_is_file, check_places
 from hwp_bench.base.tables import print_table
 from hwp_bench.cli.options import (
     SEVERAL,
@@ -304,6 +304,7 @@ def _track(args: argparse.Namespace) -> int:
         return print_result(args.json, {"models": str(folder)}, [f"networks: {folder}"])
     if args.video is None:
         raise UsageError("VIDEO is missing", remedy="Give a video, or --fetch.")
+    check_is_file(args.video, field="VIDEO")
     out = args.out or args.video.with_suffix(".npz")
     outputs = {"--out": out, "--sheet": args.sheet}
     check_places(outputs, {"VIDEO": args.video, "--model": args.model})

@@ -23,7 +23,7 @@ import torch
 from msgspec import Meta
 
 from hwp_bench.base.errors import BadInput, HwpError, place, shown
-from hwp_bench.base.files import atomic_folder, read_json, write_json
+from hwp_bench.base.files import atomic_folder, read_json, refuse_other, write_json
 from hwp_bench.base.images import read_gray, write_image
 from hwp_bench.base.records import Seed, parse_record
 from hwp_bench.capture.schema import SIDES, HandModelId
@@ -156,6 +156,11 @@ class _Description:
     ) = None
 
 
+def refuse_no_avatar(path: str | os.PathLike[str]) -> None:
+    """Refuse the place of an avatar where something else is."""
+    refuse_other(path, "an avatar", lambda folder: (folder / DESCRIPTION).is_file())
+
+
 def save_avatar(
     avatar: WildGHandAvatar,
     path: str | os.PathLike[str],
@@ -168,7 +173,7 @@ def save_avatar(
     Args:
         avatar: the avatar.
         path: the folder to make.
-        overwrite: replace an existing folder.
+        overwrite: replace an existing avatar.
         call: digest of the call that makes it, by which a second one knows that it is complete.
 
     Raises:
@@ -188,6 +193,7 @@ def save_avatar(
         fit=avatar.record,
         tensors=sorted(tensors),
     )
+    refuse_no_avatar(path)
     with atomic_folder(path, overwrite=overwrite, flag="--overwrite") as folder:
         # Not `save_file`, which makes a file that only its owner may read.
         data = save({name: value.detach().cpu().contiguous() for name, value in tensors.items()})
@@ -263,10 +269,12 @@ def load_avatar(
         problem = str(error).splitlines()[0][:300]
         raise BadInput(f"does not hold this avatar's tensors ({problem})", where=file) from error
     betas = {side: np.array(given) for side, given in value.betas.items()}
+    # What draws the avatar loads the hand model again.
+    hand_model = dataclasses.replace(value.hand_model, source=hand or value.hand_model.source)
     avatar = WildGHandAvatar(
         model.eval(),
         settings,
-        value.hand_model,
+        hand_model,
         betas,
         mean_color,
         value.seed,
@@ -290,6 +298,26 @@ def _check_description(value: _Description) -> None:
                 field=f"betas.{side}",
                 remedy=_ANOTHER_COPY,
             )
+    _check_record(value.fit, value.sides)
+
+
+def _check_record(fit: FitRecord, sides: Sequence[str]) -> None:
+    """Check that what is said of the fitted frames is said of each of them, once."""
+    others = sorted(fit.temporal.keys() - set(sides))
+    if others:
+        problem = f"names {shown(others[0])[:40]!r}, which is not a hand of the avatar"
+        raise BadInput(problem, field="fit.temporal", remedy=_ANOTHER_COPY)
+    count = len(fit.frames)
+    if len(set(fit.frames)) < count:
+        raise BadInput("names a frame twice", field="fit.frames", remedy=_ANOTHER_COPY)
+    lengths = {f"temporal.{side}": len(values) for side, values in fit.temporal.items()}
+    # These may be empty.
+    lengths["clean"] = len(fit.clean) or count
+    lengths["frame_weights"] = len(fit.frame_weights) or count
+    for name, length in lengths.items():
+        if length != count:
+            problem = f"has {length} numbers where {count} frames were fitted"
+            raise BadInput(problem, field=f"fit.{name}", remedy=_ANOTHER_COPY)
 
 
 def _templates(

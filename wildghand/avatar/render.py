@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ import torch
 from hwp_bench.base.console import track
 from hwp_bench.base.drawing import labelled, sheet
 from hwp_bench.base.errors import UsageError
-from hwp_bench.base.files import atomic_folder, check_places
+from hwp_bench.base.files import atomic_folder, check_places, refuse_other
 from hwp_bench.base.images import as_uint8, check_encoder, write_image, write_movie
 from hwp_bench.capture import Capture
 from wildghand.avatar.avatar import WildGHandAvatar
@@ -33,7 +34,8 @@ def render_clip(
     video: Path | None = None,
     overwrite: bool = False,
 ) -> dict[str, Any]:
-    """Draw frames into a folder, whole or not at all."""
+    """Draw frames into a folder, whole or not at all; `overwrite` replaces a folder of frames."""
+    refuse_other(out, "frames", _holds_frames)
     check_places({"out": out, "video": video}, {"poses": capture.root}, replaces=overwrite)
     sides = shown_sides(avatar, capture)
     if video is not None:
@@ -59,6 +61,10 @@ def render_clip(
                 ]
             write_movie(video, images, capture.info.fps, times)
     return {"frames": len(frames), "frames_per_second": len(frames) / max(seconds, 1e-9)}
+
+
+def _holds_frames(folder: Path) -> bool:
+    return all(re.fullmatch(r"\d{6}\.png", path.name) for path in folder.iterdir())
 
 
 def shown_sides(avatar: WildGHandAvatar, capture: Capture) -> list[str]:

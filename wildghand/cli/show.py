@@ -162,9 +162,9 @@ def _add_export(parser: argparse.ArgumentParser) -> None:
         "how strongly colours of Gaussians may depend on the view, 0 to 3 "
         "(default: 3; 0: one colour each, and a third of the size)"
     )
-    add("--harmonics", type=int, default=3, metavar="DEGREE", help=degree)
+    add("--harmonics", type=int, metavar="DEGREE", help=degree)
     texels = "edge of a mesh's texture (default: 1024)"
-    add("--texture", type=int, default=1024, metavar="TEXELS", help=texels)
+    add("--texture", type=int, metavar="TEXELS", help=texels)
     add_ending(parser, "file")
 
 
@@ -180,8 +180,9 @@ def _do_export(args: argparse.Namespace) -> int:
 
     counts: dict[str, int]
     if args.avatar.is_file():
-        if args.poses is not None:
-            raise UsageError("needs an avatar, not Gaussians of one pose", field="--poses")
+        for option, given in (("--poses", args.poses), ("--hand-model", args.hand_model)):
+            if given is not None:
+                raise UsageError("needs an avatar, not Gaussians of one pose", field=option)
         from wildghand.export.official import read_official_gaussians
 
         splats = read_official_gaussians(args.avatar)

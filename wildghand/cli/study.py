@@ -132,6 +132,7 @@ def _add_explain(parser: argparse.ArgumentParser) -> None:
     add("-o", "--out", type=Path, required=True, metavar="FILE", help="PNG file")
     text = "frames of the capture"
     add("--frames", type=int, nargs="+", action="extend", metavar="N", help=text)
+    add_json(parser)
 
 
 def _do_explain(args: argparse.Namespace) -> int:
@@ -144,18 +145,27 @@ def _do_explain(args: argparse.Namespace) -> int:
     capture = open_capture(args.capture)
     avatar = avatar_of(args)
     found = explain_frames(avatar, capture, args.frames)
-    record = avatar.record
-    if record.clean and record.frame_weights:
-        floor = avatar.settings.prepass.weight_floor
-        print(frames_text(record.clean, record.frame_weights, floor))
-    for side, (size, rank) in temporal_weights(avatar, capture).items():
-        told = "not known" if rank is None else f"{rank:.2f}"
-        print(f"{side} hand: mean |omega| {size:.2g}, rank correlation with severity {told}")
     names = {}
     for item in found:
         acting = [kind for kind, level in capture.info.severity(item.frame).items() if level]
         names[item.frame] = ", ".join(kind.replace("_", " ") for kind in acting)
     write_image(args.out, explanation_sheet(found, names))
+    weights = temporal_weights(avatar, capture)
+    if args.json:
+        hands = {
+            side: {"mean_omega": size, "rank_with_severity": rank}
+            for side, (size, rank) in weights.items()
+        }
+        frames = {item.frame: item.omega for item in found}
+        print_json({"file": str(args.out), "frames": frames, "hands": hands})
+        return 0
+    record = avatar.record
+    if record.clean and record.frame_weights:
+        floor = avatar.settings.prepass.weight_floor
+        print(frames_text(record.clean, record.frame_weights, floor))
+    for side, (size, rank) in weights.items():
+        told = "not known" if rank is None else f"{rank:.2f}"
+        print(f"{side} hand: mean |omega| {size:.2g}, rank correlation with severity {told}")
     print(f"{args.out}: {len(found)} frames")
     return 0
 

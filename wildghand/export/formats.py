@@ -62,10 +62,10 @@ class ExportSettings:
     #: Upright, the palm to SuperSplat's first view, and ten times the size; .ply only.
     supersplat: bool = False
     #: Degree of the spherical harmonics by which the colours of Gaussians change with the side they
-    #: are seen from, 0 to 3.
-    harmonics: int = MAX_DEGREE
-    #: Edge of a mesh's texture, texels, 64 to 4096.
-    texture: int = SIZE
+    #: are seen from, 0 to 3; None: 3.
+    harmonics: int | None = None
+    #: Edge of a mesh's texture, texels, 64 to 4096; None: 1024.
+    texture: int | None = None
 
 
 def check_target(path: Path, settings: ExportSettings, *, overwrite: bool) -> None:
@@ -82,15 +82,17 @@ def check_target(path: Path, settings: ExportSettings, *, overwrite: bool) -> No
     for field, given, problem in (
         ("--mesh", settings.mesh and suffix != ".glb", "a mesh is written as .glb"),
         ("--scale", settings.mesh and other, "a mesh is in metres"),
+        ("--harmonics", settings.mesh and settings.harmonics is not None, "is of Gaussians"),
+        ("--texture", not settings.mesh and settings.texture is not None, "is of a mesh (--mesh)"),
         ("--supersplat", settings.supersplat and suffix != ".ply", "is for .ply"),
         ("--supersplat", settings.supersplat and other, "sets the scale itself"),
     ):
         if given:
             raise UsageError(problem, where=path, field=field)
     require_scale(settings.scale)
-    if not 0 <= settings.harmonics <= MAX_DEGREE:
+    if settings.harmonics is not None and not 0 <= settings.harmonics <= MAX_DEGREE:
         raise UsageError(f"is {settings.harmonics}", field="--harmonics", remedy="Use 0 to 3.")
-    if not 64 <= settings.texture <= 4096:
+    if settings.texture is not None and not 64 <= settings.texture <= 4096:
         raise UsageError(f"is {settings.texture}", field="--texture", remedy="Use 64 to 4096.")
     if path.exists() and not overwrite:
         raise UsageError("exists", where=path, remedy="Give --overwrite to replace it.")
@@ -109,7 +111,8 @@ def export(
     settings = settings or ExportSettings()
     check_target(path, settings, overwrite=overwrite)
     if settings.mesh:
-        data, counts = _mesh_bytes(avatar, capture, settings.texture)
+        texels = SIZE if settings.texture is None else settings.texture
+        data, counts = _mesh_bytes(avatar, capture, texels)
     else:
         data, counts = _splat_bytes(avatar, path.suffix.lower(), settings, capture, frame or 0)
     atomic_write(path, data, overwrite=overwrite, flag="--overwrite")
@@ -126,7 +129,7 @@ def export_gaussians(
     """Write Gaussians with one colour each for other programs, where they lie; y is down."""
     settings = settings or ExportSettings()
     check_target(path, settings, overwrite=overwrite)
-    for field in ("mesh", "supersplat"):
+    for field in ("mesh", "supersplat", "harmonics"):
         if getattr(settings, field):
             raise UsageError("needs an avatar, not Gaussians of one pose", field=f"--{field}")
     suffix = path.suffix.lower()
@@ -164,7 +167,8 @@ def _splat_bytes(
         axes = "y is down, z is front"
     if suffix != ".ply" and down:
         given = given.moved(HALF_TURN, np.zeros(3))
-    placed, colors = scaled(given.splats, scale), harmonics(given, settings.harmonics)
+    degree = MAX_DEGREE if settings.harmonics is None else settings.harmonics
+    placed, colors = scaled(given.splats, scale), harmonics(given, degree)
     return _file_of(placed, colors, suffix, scale, axes), {"gaussians": len(placed)}
 
 

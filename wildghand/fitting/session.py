@@ -27,7 +27,13 @@ from hwp_bench.capture.splits import Split, contiguous_split
 from hwp_bench.methods.contract import REQUEST, Avatar, Budget, RunSettings
 from hwp_bench.methods.request import open_request, write_request
 from wildghand.avatar.avatar import WildGHandAvatar
-from wildghand.avatar.files import CALL, load_avatar, made_by_call, save_avatar
+from wildghand.avatar.files import (
+    CALL,
+    load_avatar,
+    made_by_call,
+    refuse_no_avatar,
+    save_avatar,
+)
 from wildghand.fitting.components import make_fit
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.method import affordable, ready_fit
@@ -85,9 +91,10 @@ class _Clock:
         return time.perf_counter() - self._start
 
 
-def unfinished(out: Path) -> Path:
-    """Return the folder of the state of a fit to an avatar folder, until it is finished."""
-    return out.with_name(out.name + ".fit")
+def unfinished(out: Path, ending: str = ".fit") -> Path:
+    """Return the folder of the state of a fit to an output folder, until it is finished."""
+    named = Path(os.path.abspath(out))  # A folder may be given as `.`, which is no name.
+    return named.with_name(named.name + ending)
 
 
 @denormals_flushed()
@@ -117,6 +124,8 @@ def fit_capture(
     run = RunSettings(dict(settings or {}), seed, budget or Budget())
     if out is None and world.size > 1:
         raise UsageError("is missing; several processes share a fit in its folder", field="out")
+    if out is not None:
+        refuse_no_avatar(out)
     exists = UsageError("exists", where=out, remedy="Choose another name, or give --overwrite.")
     kept = out is not None and Path(out).exists() and not overwrite
     if out is not None and kept and not (Path(out) / CALL).is_file():

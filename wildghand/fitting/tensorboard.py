@@ -26,6 +26,7 @@ def logging_fit(
         yield watch
         return
     problem = "tensorboard is not installed"
+    import_extra("tensorboard", "tensorboard", problem)
     writers = import_extra("torch.utils.tensorboard", "tensorboard", problem)
 
     def show(look: Glance) -> None:

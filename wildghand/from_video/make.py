@@ -32,6 +32,7 @@ from wildghand.from_video.run import (
     VideoFit,
     VideoJob,
     run_stages,
+    stride,
     with_quick,
 )
 from wildghand.from_video.stages import STAGES
@@ -154,11 +155,12 @@ def _check_folder(job: VideoJob, *, overwrite: bool) -> None:
     ours = job.record.is_file() or [path.name for path in folder.iterdir()] == [job.work.name]
     if ours or (overwrite and (folder / DESCRIPTION).is_file()):
         return
-    raise UsageError(
-        "exists and is not the folder of an avatar that was made of a video",
-        where=folder,
-        remedy="Choose another name, or delete it.",
-    )
+    problem = "exists and is not the folder of an avatar that was made of a video"
+    remedy = "Choose another name, or delete it."
+    if (folder / DESCRIPTION).is_file():
+        problem = "holds an avatar whose folder work is gone, or that was made of a capture"
+        remedy = "Choose another name, or give --overwrite to make it again."
+    raise UsageError(problem, where=folder, remedy=remedy)
 
 
 # Bytes of a job, for each stored pixel and for all the rest: on the disk, and in memory, where the
@@ -173,7 +175,8 @@ def _check_requirements(job: VideoJob) -> None:
     check_encoder()
     if job.options.landmarks is None and not job.landmarks.is_file():
         LiteRtNetworks(load_models(job.options.tracker))
-    frames = min(info.stated_frames or FRAMES, job.options.most_frames)
+    count = info.stated_frames or FRAMES
+    frames = -(-count // stride(count, job.options.most_frames))
     pixels = frames * job.options.size**2
     place = next(one for one in (job.folder, *job.folder.absolute().parents) if one.is_dir())
     left = {

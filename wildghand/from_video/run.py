@@ -4,7 +4,8 @@ my_hand/                    an avatar folder: avatar.json, model.safetensors, we
 my_hand/turntable.mp4       the avatar turned around
 my_hand/sheet.jpg           frames, the avatar in their poses, its weights, and all sides
 my_hand/avatar.html         a page that turns and poses the avatar
-my_hand/work                can be deleted once the avatar pleases; a second run then begins again
+my_hand/work                can be deleted once the avatar pleases; without it a second run needs
+                            --overwrite, and makes everything again
     landmarks.npz           the tracked hands
     capture/                the imported capture
     avatar/, avatar.fit/    the finished fit; the state of one that continues
@@ -39,8 +40,8 @@ from wildghand.fitting.parallel import SINGLE_PROCESS, World
 from wildghand.fitting.session import Watch
 from wildghand.model.settings import nested
 
-#: Most frames that are imported, spread over the video, by default and with `quick`: 20 s at 15
-#: frames a second, and a third of that. Neighbours show the same.
+#: About how many frames are imported of a longer video, by default and with `quick`: 20 s at 15
+#: frames a second, and a third of that. Neighbours show the same. See `stride`.
 FRAMES, QUICK_FRAMES = 300, 100
 #: What the avatar of a video has in place of the method's settings: no Gaussians so wide that they
 #: draw a rim outside of the hand, which a score hardly sees and a person does; opacities that are
@@ -53,8 +54,10 @@ VIDEO: Mapping[str, Any] = MappingProxyType(
         "schedule": {"steps": 400},
     }
 )
-#: What `quick` changes of the method's settings: fewer Gaussians, fewer steps.
-QUICK: Mapping[str, Any] = MappingProxyType({"gaussians": 5000, "schedule": {"steps": 250}})
+#: What `quick` changes of the method's settings: fewer Gaussians, fewer steps, in every mode.
+QUICK: Mapping[str, Any] = MappingProxyType(
+    {"gaussians": 5000, "schedule": {"steps": 250, "epochs": 0}}
+)
 
 
 @dataclass(frozen=True)
@@ -97,11 +100,16 @@ class VideoFit:
             ("--steps", self.steps is None or self.steps >= 1, "must be 1 or more"),
             ("--budget", self.seconds is None or self.seconds > 0.0, "must be more than 0"),
             ("--seed", self.seed >= 0, "must be 0 or more"),
+            (
+                "--model",
+                self.landmarks is None or self.tracker is None,
+                "is for tracking, and --landmarks names hands that are tracked already",
+            ),
         )
 
     @property
     def most_frames(self) -> int:
-        """Most frames that are imported."""
+        """About how many frames are imported of a longer video."""
         return QUICK_FRAMES if self.quick else FRAMES
 
     def method_settings(self) -> dict[str, Any]:
@@ -112,6 +120,15 @@ class VideoFit:
 def with_quick(settings: Mapping[str, Any], *, quick: bool) -> dict[str, Any]:
     """Return settings of the method; if `quick`, with `QUICK` in place of what they leave out."""
     return merged(QUICK, nested(settings)) if quick else dict(settings)
+
+
+def stride(count: int, most: int) -> int:
+    """Return the distance between imported frames.
+
+    It is the nearest whole number to `count / most`: less than half more than `most` frames are
+    imported of `count`.
+    """
+    return max(1, round(count / most))
 
 
 class VideoJob:

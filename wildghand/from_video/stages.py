@@ -26,12 +26,13 @@ from hwp_bench.importers.video.api import IMPORTER_VERSION
 from hwp_bench.importers.video.decode import probe
 from hwp_bench.methods.contract import Budget, HandPose
 from hwp_bench.tracking import TrackerSettings, track_video
+from hwp_bench.tracking.networks import load_models
 from hwp_bench.tracking.track_video import NoHandSeen, landmark_sheet
 from wildghand.avatar.avatar import WildGHandAvatar
-from wildghand.avatar.files import DESCRIPTION, MODEL, WEIGHTS, load_avatar
+from wildghand.avatar.files import CALL, DESCRIPTION, MODEL, WEIGHTS, load_avatar
 from wildghand.avatar.studio import REST, Pose
 from wildghand.fitting.session import fit_capture, unfinished
-from wildghand.from_video.run import Stage, VideoJob
+from wildghand.from_video.run import Stage, VideoJob, stride
 from wildghand.from_video.verdict import judge_avatar, read_verdict
 from wildghand.model.settings import read_settings
 from wildghand.page import write_page
@@ -183,7 +184,7 @@ class TrackStage(Stage):
         if given is not None:
             check_is_file(given, field="--landmarks")
             return {"landmarks": sha256_of(given)}
-        tracker = "shipped" if model is None else str(model)
+        tracker = "shipped" if model is None else load_models(model).digest
         return {"video": sha256_of(job.video), "tracker": tracker}
 
     def run(self, job: VideoJob) -> None:
@@ -236,11 +237,6 @@ class Import(Stage):
         # A frame takes 0.3 s, one that is decoded only 5 ms.
         count = _frame_count(job)
         return 0.3 * (count / stride(count, job.options.most_frames)) + 0.005 * count
-
-
-def stride(count: int, most: int) -> int:
-    """Return the distance between imported frames: `count` frames become about `most` or fewer."""
-    return max(1, round(count / most))
 
 
 def import_options(job: VideoJob) -> VideoImport:
@@ -331,7 +327,8 @@ class Place(Stage):
 
     def run(self, job: VideoJob) -> None:
         try:
-            (job.folder / DESCRIPTION).unlink(missing_ok=True)
+            for name in (DESCRIPTION, CALL):  # The call is that of another avatar.
+                (job.folder / name).unlink(missing_ok=True)
             shutil.rmtree(job.folder / WEIGHTS, ignore_errors=True)
             if (job.fitted / WEIGHTS).is_dir():
                 shutil.copytree(job.fitted / WEIGHTS, job.folder / WEIGHTS)

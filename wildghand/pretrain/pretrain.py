@@ -24,12 +24,18 @@ from hwp_bench.methods.request import open_request, write_request
 from wildghand.fitting.components import make_fit
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.method import ready_fit
-from wildghand.fitting.session import STATE, digest_of_request, every_frame, run_resumed
+from wildghand.fitting.session import (
+    STATE,
+    digest_of_request,
+    every_frame,
+    run_resumed,
+    unfinished,
+)
 from wildghand.gaussians.fit_loop import Loss, batches
 from wildghand.model.settings import WildGHandSettings, read_settings
 from wildghand.network import PredictionNetwork
 from wildghand.plain.loop import IterativeFit
-from wildghand.prior.prior import MAPS, Prior, mean_weights, save_prior
+from wildghand.prior.prior import MAPS, Prior, mean_weights, refuse_no_prior, save_prior
 from wildghand.splat.threads import denormals_flushed
 
 # Children of a network that belong to its subject.
@@ -56,6 +62,7 @@ def pretrain(
     Args:
         steps: optimizer steps over all captures; None: the settings' number for each capture.
     """
+    refuse_no_prior(out)
     if out.exists() and not overwrite:
         raise UsageError("exists", where=out, remedy="Choose another name, or give --overwrite.")
     # A new prior starts from neither the one that ships nor one person's colours, and knows light
@@ -71,7 +78,7 @@ def pretrain(
     _check_captures(captures)
     chosen = read_settings(settings)
     run = RunSettings(dict(settings), seed, Budget(steps=steps))
-    work = out.with_name(out.name + ".pretrain")
+    work = unfinished(out, ".pretrain")
     with exclusive(work):
         weights, done = _fit_in(work, captures, run, chosen)
         prior = save_prior(

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from hwp_bench.base.errors import BadInput, HwpError
-from hwp_bench.base.files import atomic_folder, inside, read_json, write_json
+from hwp_bench.base.files import atomic_folder, inside, read_json, refuse_other, write_json
 from hwp_bench.base.packages import PACKAGES
 from hwp_bench.base.records import Count, Seed, parse_record
 from hwp_bench.capture.schema import HandModelId
@@ -166,6 +166,11 @@ def find_prior(text: str) -> Path:
     return path
 
 
+def refuse_no_prior(path: str | os.PathLike[str]) -> None:
+    """Refuse the place of a prior where something else is."""
+    refuse_other(path, "a prior", lambda folder: (folder / DESCRIPTION).is_file())
+
+
 def save_prior(
     path: str | os.PathLike[str],
     tensors: Mapping[str, Tensor],
@@ -195,6 +200,7 @@ def save_prior(
         steps=steps,
         weights=hashlib.sha256(data).hexdigest(),
     )
+    refuse_no_prior(path)
     with atomic_folder(path, overwrite=overwrite, flag="--overwrite") as folder:
         (folder / WEIGHTS).write_bytes(data)
         write_json(folder / DESCRIPTION, dataclasses.asdict(record))

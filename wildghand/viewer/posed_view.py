@@ -122,10 +122,8 @@ class Motion:
 
 def capture_of(avatar: Path) -> Path | None:
     """Return the capture folder that lies with an avatar folder, as a fit of a video leaves it."""
-    for folder in (avatar / "work" / "capture", avatar.with_name(avatar.name + ".capture")):
-        if (folder / METADATA).is_file():
-            return folder
-    return None
+    folder = avatar / "work" / "capture"
+    return folder if (folder / METADATA).is_file() else None
 
 
 #: Hands as they are shown, by side.

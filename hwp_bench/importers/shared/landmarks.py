@@ -375,7 +375,8 @@ def read_landmarks(
             f"no frame has a score of at least {min_score:g}",
             where=path,
             field="score",
-            remedy="Track a hand first, or lower --min-score.",
+            remedy="Track a hand first, or accept lower scores "
+            "(`hwp-bench data import video --min-score`).",
         )
     extent = np.median(np.ptp(world[detected], axis=1).max(axis=1))
     low, high = HAND_METRES

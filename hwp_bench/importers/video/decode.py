@@ -284,7 +284,8 @@ def read_frames(
                 raise BadInput(
                     f"frame {index} is not of the size {info.width}x{info.height}",
                     where=info.path,
-                    remedy="Re-encode the video, or take other frames with --range.",
+                    remedy="Re-encode the video, or import the frames of one size "
+                    "(`hwp-bench data import video --range`).",
                 )
             yield index, video.picture(frame, colours)
         if selection.stop is None:
@@ -294,7 +295,8 @@ def read_frames(
             raise BadInput(
                 f"ends after {video.decoded} frames, {selection.stop} are selected",
                 where=info.path,
-                remedy="Choose other frames with --range; the file may be truncated.",
+                remedy="Choose other frames (`hwp-bench data import video --range`); the file may "
+                "be truncated.",
             )
 
 

@@ -242,7 +242,10 @@ def descend(
         for field in fields(model.variables)
         if field.name not in hold
     ]
-    remedy = "Check the landmarks; a focal length far off can do this too (--focal)."
+    remedy = (
+        "Check the landmarks; a focal length far off can do this too "
+        "(`hwp-bench data import video --focal`)."
+    )
     minimize(groups, lambda _: energy(model), steps, warm_up=_WARM_UP, remedy=remedy, tick=tick)
 
 

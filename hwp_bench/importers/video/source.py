@@ -250,8 +250,8 @@ def _check_memory(windows: CropWindows) -> None:
         raise UsageError(
             f"{len(windows.corners)} frames need about {needed / 1e9:.1f} GB of memory, "
             f"{free / 1e9:.1f} GB are free",
-            field="--range",
-            remedy="Take fewer frames with --range or --stride, or a smaller --size.",
+            remedy="Take a shorter video, or a smaller --size; `hwp-bench data import video` has "
+            "--range and --stride too.",
         )
 
 

@@ -138,6 +138,13 @@ def test_a_refusal_names_the_option_where_there_is_one(tmp_path: Path) -> None:
         pass
     assert "--" not in str(plain.value).replace(str(tmp_path), "")
     assert str(tmp_path) in str(caught.value)
+    # A folder replaces no file, with the option or without.
+    for overwrite in (False, True):
+        with (
+            pytest.raises(UsageError, match=r"exists already\. Choose another place\.$"),
+            atomic_folder(tmp_path / "file", overwrite=overwrite, flag="--overwrite"),
+        ):
+            pass
 
 
 @pytest.mark.parametrize(

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import argparse
+import ast
 import errno
 import json
 import os
 import pickle
+import re
 import shutil
+import sys
 import warnings
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,11 +22,14 @@ from made_results import made_results
 from small_captures import CaptureMaker
 from synthetic_mano import mano_content
 
-from hwp_bench.base.errors import BadInput, HwpError, reason_of
+from hwp_bench.base.errors import BadInput, HwpError, MissingDependency, reason_of
 from hwp_bench.base.files import atomic_write, cache_root
+from hwp_bench.base.packages import PACKAGES, import_extra
 from hwp_bench.cli.main import main
+from hwp_bench.cli.program import whole_parser
 from hwp_bench.hands.sources import load_mano
 from hwp_bench.results import write_results
+from wildghand.cli.main import command_tree
 
 
 def test_the_reason_is_said_for_every_kind_of_error(tmp_path: Path) -> None:
@@ -147,3 +154,51 @@ def test_the_sheet_is_explained_with_the_words_on_it() -> None:
 
     for name in PERTURBATIONS:
         assert f"{perturbation(name).short}: " in _SHOW
+
+
+def test_an_import_names_options_of_a_fit_or_their_command() -> None:
+    """`wildghand fit VIDEO` imports too. Oracle: its parser."""
+    (commands,) = (
+        action.choices
+        for action in whole_parser("wildghand", command_tree())._actions
+        if isinstance(action, argparse._SubParsersAction)
+    )
+    known, named = commands["fit"]._option_string_actions, 0
+    folder = PACKAGES / "hwp_bench" / "importers"
+    for path in (*sorted((folder / "video").glob("*.py")), folder / "shared" / "landmarks.py"):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            targets = getattr(node, "targets", []) if isinstance(node, ast.Assign) else []
+            names = {getattr(node, "arg", ""), *(getattr(one, "id", "") for one in targets)}
+            if not isinstance(node, ast.Assign | ast.keyword) or "remedy" not in names:
+                continue
+            text = ast.unparse(node.value)
+            for option in re.finditer(r"--[a-z-]+", text):
+                named += 1
+                command = "`hwp-bench data" in text[: option.start()]
+                assert command or option.group() in known, f"{path.name}: {text}"
+    assert named > 5
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (None, "an_extra is missing here"),
+        ("", "an_extra is missing here"),
+        ("raise ImportError('libGL.so.1: cannot open')", "an_extra is installed.*libGL.so.1: cann"),
+        ("import of_which_it_needs", "an_extra is installed.*'of_which_it_needs'"),
+    ],
+    ids=["no package", "no module in it", "a library", "a package it needs"],
+)
+def test_an_extra_that_fails_is_not_called_missing(
+    content: str | None, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if content is not None:
+        (tmp_path / "an_extra").mkdir()
+        (tmp_path / "an_extra" / "__init__.py").write_text(content)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "an_extra", raising=False)
+    with pytest.raises(MissingDependency, match=said) as caught:
+        import_extra("an_extra.part", "view", "an_extra is missing here")
+    assert "pip install 'hwp-bench[view]'" in str(caught.value)
+    assert ("is missing here" in str(caught.value)) == (not content)
+    monkeypatch.delitem(sys.modules, "an_extra", raising=False)

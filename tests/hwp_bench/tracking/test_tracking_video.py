@@ -151,6 +151,8 @@ def test_mistakes_are_one_line(
     for arguments, status, message in (
         (["data", "track"], 2, "VIDEO is missing"),
         (["data", "track", str(tmp_path / "none.mp4")], 1, "does not exist"),
+        (["data", "track", "."], 1, "is a folder where a file is expected"),
+        (["data", "track", ""], 1, "is a folder where a file is expected"),
         (["data", "track", str(broken)], 1, "broken.avi"),
         (["data", "track", str(video), "-o", str(tmp_path / "x.txt")], 2, ".npz"),
         (["data", "track", str(video), "--model", str(broken)], 1, "not a readable archive"),

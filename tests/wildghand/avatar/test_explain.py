@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -68,6 +69,15 @@ def test_the_command_writes_a_picture(fitted, tmp_path: Path, capsys) -> None:
     assert "1 frames" in told
     assert "right hand: mean |omega| 0.46, rank correlation with severity not known" in told
     assert read_rgb(out).shape[1] > 4 * capture.info.width
+    assert main(["explain", *given, "--json"]) == 0
+    (explained,) = explain_frames(avatar, capture, [frame])
+    assert json.loads(capsys.readouterr().out) == {
+        "file": str(out),
+        "frames": {str(frame): pytest.approx(explained.omega)},
+        "hands": {
+            "right": {"mean_omega": pytest.approx(0.46, abs=0.01), "rank_with_severity": None}
+        },
+    }
 
 
 def test_what_cannot_be_explained_is_refused(fitted) -> None:

@@ -17,6 +17,8 @@ from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import DESCRIPTION, MODEL, load_avatar, save_avatar
 
 Change = Callable[[dict[str, Any]], Any]
+#: A fit that says nothing of single frames.
+_OF_NONE: dict[str, Any] = {"temporal": {}, "clean": [], "frame_weights": []}
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +47,7 @@ def _describe(avatar: Path, change: Change) -> None:
         (lambda v: v.update(seed=-1), "seed: is -1"),
         (lambda v: v.update(seed=2**63), "seed: is"),
         (lambda v: v.update(mean_color=[0.5] * 100_000), "mean_color"),
-        (lambda v: v["fit"].update(frames=[0] * 8192), "log_gains: is .* not .*8192"),
+        (lambda v: v["fit"].update(frames=[*range(8192)], **_OF_NONE), "log_gains.* not .*8192"),
         (lambda v: v["fit"].update(frames=[0] * 200_000), "fit.frames"),
         (lambda v: v["fit"].update(frames=[-1]), r"fit.frames\[0\]: is -1"),
         (lambda v: v["fit"].update(frames=[10**18]), r"fit.frames\[0\]"),
@@ -54,6 +56,11 @@ def _describe(avatar: Path, change: Change) -> None:
         (lambda v: v["fit"].update(temporal={"right": [1e300]}), "fit.temporal"),
         (lambda v: v["fit"].update(frame_weights=[1e300]), "fit.frame_weights"),
         (lambda v: v["fit"].update(clean=[-1e300]), "fit.clean"),
+        (lambda v: v["fit"]["frames"].__setitem__(0, v["fit"]["frames"][1]), "frames: .* twice"),
+        (lambda v: v["fit"]["temporal"]["right"].pop(), r"fit\.temporal\.right: has \d+ numbers"),
+        (lambda v: v["fit"]["temporal"].update(left=[0.5]), "fit.temporal: names 'left'"),
+        (lambda v: v["fit"]["clean"].pop(), "fit.clean: has .* another copy"),
+        (lambda v: v["fit"]["frame_weights"].append(1.0), "fit.frame_weights: has .* another copy"),
         (
             lambda v: v["betas"].update(right=[1e308] * 10),
             r"betas.right: must be ten numbers from -100 to 100.*another copy",

@@ -29,3 +29,7 @@ def test_an_existing_folder_is_refused_with_the_option_that_replaces_it(
         render_clip(avatar, capture, range(1), out)
     render_clip(avatar, capture, range(1), out, overwrite=True)
     assert [path.name for path in out.iterdir()] == ["000000.png"]
+    (out / "thesis.tex").touch()
+    with pytest.raises(UsageError, match="something else than frames"):
+        render_clip(avatar, capture, range(1), out, overwrite=True)
+    assert (out / "thesis.tex").is_file()

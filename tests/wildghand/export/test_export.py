@@ -419,6 +419,8 @@ def test_the_command_writes_each_format_and_refuses_the_rest(
         (["-o", str(tmp_path / "m.ply"), "--frame", "3"], "--poses"),
         (["-o", str(tmp_path / "m.ply"), "--harmonics", "4"], "0 to 3"),
         (["-o", str(tmp_path / "m.glb"), "--mesh", "--texture", "9"], "64 to 4096"),
+        (["-o", str(tmp_path / "m.glb"), "--mesh", "--harmonics", "0"], "--harmonics: is of"),
+        (["-o", str(tmp_path / "m.glb"), "--texture", "64"], "--texture: is of a mesh"),
         (["-o", str(tmp_path / "m.ply"), "--scale", "1e40"], "infinite"),
     )
     for words, text in refused:

@@ -174,7 +174,15 @@ def test_hostile_files_and_networks_are_refused_by_one_line(
 
 
 @pytest.mark.parametrize(
-    "words", [["--mesh"], ["--supersplat"], ["--poses", "x"]], ids=lambda words: words[0]
+    "words",
+    [
+        ["--mesh"],
+        ["--supersplat"],
+        ["--poses", "x"],
+        ["--harmonics", "2"],
+        ["--hand-model", "anny"],
+    ],
+    ids=lambda words: words[0],
 )
 def test_what_needs_an_avatar_is_refused(
     words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -14,6 +14,7 @@ from hwp_bench.capture import Capture, CaptureWriter
 from hwp_bench.capture.schema import Cameras
 from wildghand.avatar.files import load_avatar
 from wildghand.cli.main import main
+from wildghand.fitting.session import unfinished
 
 SMALL = ("--steps", "2", "--set", "gaussians=200", "--set", "device=cpu")
 
@@ -35,6 +36,16 @@ def test_too_few_frames_for_a_split_are_one_message(
     assert f"has {frames} of the 3 frames" if words else "needs at least 10 frames" in said
     assert "Traceback" not in said
     assert not out.exists()
+
+
+def test_the_state_of_a_fit_lies_next_to_its_folder_however_that_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A path has no name where it ends with a point."""
+    (tmp_path / "avatar" / "below").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "avatar")
+    for text in (".", "", "below/..", "../avatar", str(tmp_path / "avatar")):
+        assert unfinished(Path(text)) == tmp_path / "avatar.fit", text
 
 
 @pytest.mark.slow

@@ -29,13 +29,13 @@ from hwp_bench.base.images import read_rgb
 from hwp_bench.capture import open_capture
 from hwp_bench.importers.shared.landmarks import read_hand_tracks, write_hand_tracks
 from hwp_bench.tracking.networks import HAND, PALM, HandModels, models_folder
-from wildghand.avatar.files import load_avatar
+from wildghand.avatar.files import CALL, load_avatar
 from wildghand.cli.main import main
 from wildghand.from_video import VideoFit, make, make_avatar, stages
 from wildghand.from_video.run import QUICK as QUICK_CHANGES
-from wildghand.from_video.run import QUICK_FRAMES, VideoJob, with_quick
+from wildghand.from_video.run import QUICK_FRAMES, VideoJob, stride, with_quick
 from wildghand.from_video.run import VIDEO as VIDEO_CHANGES
-from wildghand.from_video.stages import STAGES, import_options, stride
+from wildghand.from_video.stages import STAGES, Place, import_options
 from wildghand.model.settings import read_settings
 
 pytestmark = pytest.mark.slow
@@ -136,6 +136,15 @@ def test_the_same_command_keeps_everything(folder: Path, capsys) -> None:
     assert result.avatar.folder == folder / "my_hand"
     assert (folder / "my_hand" / "turntable.mp4").stat().st_mtime_ns == before
     assert "all is done already" in capsys.readouterr().err
+
+
+def test_the_avatar_of_a_video_is_not_taken_for_that_of_a_captures_call(folder: Path) -> None:
+    """Oracle: `fit_capture` takes what has the call's file for complete."""
+    out = folder / "my_hand"
+    (out / CALL).write_text('{"call": "of the capture that was fitted here before"}')
+    Place().run(VideoJob(folder / "hand.avi", out, choices(folder)))
+    assert not (out / CALL).exists()
+    assert same(out, out / "work" / "avatar")
 
 
 @pytest.mark.parametrize(
@@ -481,6 +490,11 @@ def test_quick_takes_fewer_frames_and_smaller_fits() -> None:
     video, hurried = (read_settings(VideoFit(quick=q).method_settings()) for q in (False, True))
     assert hurried.schedule == quick.schedule  # not the video's, which are more
     assert quick.schedule.steps < video.schedule.steps < read_settings({}).schedule.steps
+    # A mode that counts epochs is hurried too, unless a person names a number of them.
+    paper = VideoFit(quick=True, settings={"mode": "paper"}).method_settings()
+    assert (read_settings(paper).schedule.steps, read_settings(paper).schedule.epochs) == (250, 0)
+    paper = with_quick({"mode": "paper", "schedule.epochs": 3}, quick=True)
+    assert read_settings(paper).schedule.epochs == 3
     # What a person says wins, in either form.
     for said in ({"schedule.steps": 5}, {"schedule": {"steps": 5}}):
         chosen = read_settings(with_quick(said, quick=True))

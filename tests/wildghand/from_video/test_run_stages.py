@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hwp_bench.base.errors import BadInput, HwpError
+from hwp_bench.base.errors import BadInput, HwpError, UsageError
+from hwp_bench.tracking.networks import TASK_MEMBERS
+from wildghand.from_video import make, make_avatar
 from wildghand.from_video.run import (
     JobRecord,
     Stage,
@@ -19,8 +23,10 @@ from wildghand.from_video.run import (
     read_record,
     run_stages,
     seconds_left,
+    stride,
     write_record,
 )
+from wildghand.from_video.stages import TrackStage
 
 NAMES = ("one", "two", "three")
 
@@ -197,3 +203,52 @@ def test_the_time_that_is_left_goes_by_what_was_measured() -> None:
     expected = [10.0, 20.0, 30.0]
     assert seconds_left(expected, {}, 1) == (20.0, 30.0)
     assert seconds_left(expected, {1: 40.0}, 2) == (60.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("file", "problem", "remedy"),
+    [
+        ("avatar.json", "whose folder work is gone, or that was made of a capture", "--overwrite"),
+        ("thesis.tex", "is not the folder of an avatar", "or delete it."),
+    ],
+)
+def test_a_folder_without_a_record_is_refused_by_what_is_in_it(
+    file: str, problem: str, remedy: str, tmp_path: Path
+) -> None:
+    (tmp_path / "hand").mkdir()
+    (tmp_path / "hand" / file).touch()
+    with pytest.raises(UsageError, match=problem) as caught:
+        make_avatar(tmp_path / "hand.mp4", tmp_path / "hand")
+    assert remedy in str(caught.value)
+    assert ("--overwrite" in str(caught.value)) == (remedy == "--overwrite")
+
+
+@pytest.mark.parametrize(("count", "quick"), [(16, False), (449, False), (151, True), (9000, True)])
+def test_room_is_asked_for_as_many_frames_as_are_imported(
+    count: int, quick: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Oracle: a range in steps of the stride, as the import takes them."""
+    monkeypatch.setattr(make, "probe", lambda video: SimpleNamespace(stated_frames=count))
+    monkeypatch.setattr(make, "check_encoder", lambda: None)
+    monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=0))
+    options = VideoFit(landmarks=tmp_path / "hand.npz", quick=quick)
+    taken = len(range(0, count, stride(count, options.most_frames)))
+    with pytest.raises(UsageError, match=rf": {taken} frames need about"):
+        make_avatar(tmp_path / "hand.mp4", tmp_path / "hand", options)
+
+
+def test_another_network_at_the_same_place_tracks_again(tmp_path: Path) -> None:
+    (tmp_path / "hand.mp4").touch()
+    model, facts = tmp_path / "hand_landmarker.task", []
+    job = VideoJob(tmp_path / "hand.mp4", tmp_path / "hand", VideoFit(tracker=model))
+    for content in (b"one", b"two", b"one"):
+        with zipfile.ZipFile(model, "w") as archive:
+            for name in TASK_MEMBERS:
+                archive.writestr(name, b"....TFL3" + content)
+        facts.append(TrackStage().facts(job))
+    assert facts[0] == facts[2] != facts[1]
+
+
+def test_networks_are_refused_where_landmarks_are_given() -> None:
+    with pytest.raises(UsageError, match="--model: is for tracking"):
+        VideoFit(landmarks=Path("hand.npz"), tracker=Path("hand_landmarker.task"))

@@ -222,13 +222,16 @@ def test_a_motion_plays_round_and_stops() -> None:
 
 
 def test_the_capture_that_lies_with_an_avatar_is_found(
-    make_capture: Callable[..., Capture], tmp_path: Path
+    make_capture: Callable[..., Capture], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert capture_of(tmp_path / "avatar") is None
-    next_to_it = make_capture("avatar.capture", frames=10)
-    assert capture_of(tmp_path / "avatar") == next_to_it.root
     within = make_capture("capture", frames=10, folder=tmp_path / "avatar" / "work")
     assert capture_of(tmp_path / "avatar") == within.root
+    # In the avatar's folder itself it is named `.`, of which a path has no name.
+    monkeypatch.chdir(tmp_path / "avatar")
+    assert capture_of(Path(".")) == Path("work/capture")
+    monkeypatch.chdir(tmp_path)
+    assert capture_of(Path(".")) is None
 
 
 def test_the_motion_of_a_capture_is_that_of_the_hands_that_the_avatar_has(
