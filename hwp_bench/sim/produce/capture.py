@@ -275,7 +275,7 @@ def _render_missing(request: RenderRequest, waiting: Path, on_progress: OnProgre
     # Built once here, so that no two processes paint the same skin.
     scene_hands(scene)
     for side in scene.sides:
-        skin_atlas(of_side(scene.subject, side))
+        skin_atlas(of_side(scene.subject, side), side)
     workers = request.workers
     if workers is None:
         workers = max(1, min(os.cpu_count() or 1, left // _FRAMES_PER_WORKER))

@@ -594,10 +594,21 @@ def skin_material(albedo: np.ndarray, height: np.ndarray, roughness: np.ndarray)
 
 
 @lru_cache(maxsize=4)
-def skin_atlas(subject: Subject) -> Material:
-    """Paint a subject's skin, or read it from the cache. Both hands share it, mirrored."""
-    hand = subject_hand(subject, "right")
+def skin_atlas(subject: Subject, side: str) -> Material:
+    """Paint the skin of one hand, or read it from the cache.
+
+    Both hands share it, mirrored, where they are laid out alike: those of MANO are not.
+    """
+    hand = subject_hand(subject, side)
+    if side == "left" and _laid_out_alike(hand, subject_hand(subject, "right")):
+        return skin_atlas(subject, "right")
     return kept(hand, subject, "", lambda: painted_atlas(hand, subject, ATLAS))
+
+
+def _laid_out_alike(one: SubjectHand, other: SubjectHand) -> bool:
+    """Whether each face of two hands has the same place in the atlas, up to corner order."""
+    corners, others = (np.sort(hand.template.face_uv, axis=1) for hand in (one, other))
+    return np.array_equal(corners, others) and np.array_equal(one.template.uv, other.template.uv)
 
 
 def kept(hand: SubjectHand, subject: Subject, part: str, paint: Callable[[], Material]) -> Material:
