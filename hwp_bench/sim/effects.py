@@ -18,11 +18,13 @@ from msgspec import Meta
 from hwp_bench.base.colors import lamp_color
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.records import number, parse_record
+from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.sim.geometry.noise import generator
 from hwp_bench.sim.geometry.surface import rigid, unit
 from hwp_bench.sim.light.lights import CastShadow, Lights, steady_light
 from hwp_bench.sim.props.objects import check_object
 from hwp_bench.sim.scene.scene import (
+    CLEAN_FROM,
     EffectCall,
     Episode,
     HandKey,
@@ -429,6 +431,17 @@ class FramePlan:
         return any(name in self.passes for name in ("objects", "light", "shutter"))
 
 
+def shown_in(scene: Scene, frame: int, frame_count: int) -> Scene:
+    """The scene of a frame: without effects in the first validation frame.
+
+    It comes before `CLEAN_FROM`, so that an episode may reach into it, where the number of frames
+    is no multiple of five.
+    """
+    first, _ = contiguous_split(scene.id, frame_count).validation_range
+    early = frame == first and first / frame_count < CLEAN_FROM
+    return replace(scene, effects=()) if early else scene
+
+
 def plan_frame(
     scene: Scene,
     frame: int,
@@ -437,6 +450,8 @@ def plan_frame(
     strengths: Mapping[str, float] | None = None,
 ) -> FramePlan:
     """Plan one frame."""
+    absent = {call.kind: 0 for call in scene.effects}
+    scene = shown_in(scene, frame, frame_count)
     moment = float(moments(frame_count)[frame])
     seconds = moment * scene.duration
     acting = {
@@ -464,7 +479,7 @@ def plan_frame(
     return FramePlan(
         frame=frame,
         seconds=seconds,
-        severity={call.kind: severity(call, moment) for call in scene.effects},
+        severity=absent | {call.kind: severity(call, moment) for call in scene.effects},
         strength=acting,
         subframes=subframes,
         shutter=shutter,

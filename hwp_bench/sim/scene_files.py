@@ -158,11 +158,11 @@ class _EffectTable:
         if not self.episodes:
             raise UsageError("is empty", field="episodes")
         for start, end, severity in self.episodes:
-            if not 0.0 <= start < end <= CLEAN_FROM:
+            if not 0.0 <= start < end < CLEAN_FROM:
                 raise UsageError(
-                    f"[{start}, {end}] does not lie in order within 0 and {CLEAN_FROM}",
+                    f"[{start}, {end}] does not lie in order from 0 to below {CLEAN_FROM}",
                     field="episodes",
-                    remedy="The last fifth (validation and test) stays clean.",
+                    remedy="The last fifth (validation and test) stays clean, its first moment too.",
                 )
             if not 1.0 <= severity <= MAX_SEVERITY:
                 raise UsageError(

@@ -39,7 +39,7 @@ from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.run.engine import Engine, Job, LocalEngine, Needs
 from hwp_bench.run.engine.job import OnProgress, ignore_progress
 from hwp_bench.run.engine.processes import THREADS, LocalJob, Stopped, WorkerLost, run_in_process
-from hwp_bench.sim.effects import FramePlan, hands_at, plan_frame
+from hwp_bench.sim.effects import FramePlan, hands_at, plan_frame, shown_in
 from hwp_bench.sim.hand.rigs import rig_path
 from hwp_bench.sim.produce.estimates import confused_mask, estimate_hands, estimate_mask
 from hwp_bench.sim.produce.free_view import FRAMES as FREE_FRAMES
@@ -460,7 +460,9 @@ def _waiting_frame(waiting: Path, frame: int) -> dict[str, np.ndarray]:
 
 def true_hands(scene: Scene, plans: list[FramePlan]) -> dict[str, HandParameters]:
     """The true hand parameters of every frame, by side."""
-    return parameters_of(scene, [hands_at(scene, item.seconds) for item in plans])
+    count = len(plans)
+    moments = [hands_at(shown_in(scene, item.frame, count), item.seconds) for item in plans]
+    return parameters_of(scene, moments)
 
 
 def _info(scene: Scene, plans: list[FramePlan], size: int) -> CaptureInfo:

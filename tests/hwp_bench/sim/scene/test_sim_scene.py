@@ -174,6 +174,7 @@ def test_nothing_acts_in_validation_and_test(name: str) -> None:
         ("[[0.3, 0.4, 3]]", "[[0.3, 0.4, 7]]", "effects[1].episodes"),
         ("[[0.3, 0.4, 3]]", "[[0.4, 0.3, 3]]", "effects[1].episodes"),
         ("[[0.3, 0.4, 3]]", "[[0.3, 0.9, 3]]", "effects[1].episodes"),
+        ("[[0.3, 0.4, 3]]", "[[0.7, 0.8, 3]]", "effects[1].episodes"),
         ("[[0.3, 0.4, 3]]", "[[0.21, 0.79, 3]]", "effects"),
         ('object = "block"', 'object = "brick"', "object"),
         ('anchor = "right"', 'anchor = "left"', "anchor"),
