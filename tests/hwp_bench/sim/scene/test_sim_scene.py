@@ -136,6 +136,16 @@ def test_a_clean_share_that_episodes_cannot_have_is_refused(make_scene: SceneMak
         with_clean_share(with_severity(make_scene(), 1), 0.1)
 
 
+def test_a_changed_scene_states_no_clean_share_that_is_false() -> None:
+    # Oracle: the share as it is measured. Ends of episodes of severity 1 are clean.
+    scene = load_scene("persistent-2")
+    assert with_severity(scene, 3).clean_share == scene.clean_share == 0.1
+    mild = with_severity(scene, 1)
+    assert clean_share(mild) > 0.15
+    assert mild.clean_share is None
+    assert with_effects(scene, ()).clean_share is None
+
+
 def test_a_scene_file_says_its_clean_share(make_scene: SceneMaker) -> None:
     text = ("seed = 5", "seed = 5\nclean_share = 0.2")
     assert make_scene(text) == with_clean_share(make_scene(), 0.2)
