@@ -304,7 +304,9 @@ class Illumination(Effect):
     ) -> Lights:
         """Change the light as the mode of the episode says."""
         moment = seconds / scene.duration
-        number = next((i for i, e in enumerate(call.episodes) if e.start <= moment <= e.end), 0)
+        # The nearest: rounding may put the moment of an episode's end outside of it.
+        away = [max(part.start - moment, moment - part.end, 0.0) for part in call.episodes]
+        number = away.index(min(away))
         mode = self.modes[number % len(self.modes)]
         if mode in ("dim", "bright"):
             stops = -1.0 if mode == "dim" else 0.7
