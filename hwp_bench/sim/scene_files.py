@@ -162,7 +162,7 @@ class _EffectTable:
                 raise UsageError(
                     f"[{start}, {end}] does not lie in order from 0 to below {CLEAN_FROM}",
                     field="episodes",
-                    remedy="The last fifth (validation and test) stays clean, its first moment too.",
+                    remedy="The last fifth (validation and test) stays clean.",
                 )
             if not 1.0 <= severity <= MAX_SEVERITY:
                 raise UsageError(

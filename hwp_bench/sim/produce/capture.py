@@ -63,7 +63,7 @@ from hwp_bench.sim.scene.scene import (
 )
 from hwp_bench.sim.scene_files import load_scene, scene_names
 from hwp_bench.sim.sensor import check_encoder, through_h264
-from hwp_bench.sim.subject.hand import of_side, skin_atlas
+from hwp_bench.sim.subject.hand import model_digests, of_side, skin_atlas
 
 #: Version of the pixels that the renderer makes; part of every render key.
 RENDERER = 10
@@ -93,7 +93,8 @@ def check_extent(frame_count: int, size: int, workers: int | None = None) -> Non
 
 def render_key(scene: Scene, frame_count: int, size: int) -> str:
     """Digest of everything that decides the pixels of a capture."""
-    return sha256_json([RENDERER, scene.digest, frame_count, size])
+    files = model_digests(scene.subject)
+    return sha256_json([RENDERER, scene.digest, frame_count, size, *files])
 
 
 @dataclass(frozen=True)
@@ -466,7 +467,7 @@ def true_hands(scene: Scene, plans: list[FramePlan]) -> dict[str, HandParameters
 
 
 def _info(scene: Scene, plans: list[FramePlan], size: int) -> CaptureInfo:
-    model = scene_hands(scene)[scene.sides[0]].model
+    model, files = scene_hands(scene)[scene.sides[0]].model, model_digests(scene.subject)
     known = "anny" if rig_path(scene.subject.model) is not None else scene.subject.model
     return CaptureInfo(
         id=scene.id,
@@ -489,6 +490,7 @@ def _info(scene: Scene, plans: list[FramePlan], size: int) -> CaptureInfo:
             "seed": scene.seed,
             "renderer": RENDERER,
             **({} if scene.clean_share is None else {"clean_share": scene.clean_share}),
+            **({"model_files": files} if files else {}),
         },
         licence=LICENCE,
     )

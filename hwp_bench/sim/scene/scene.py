@@ -233,7 +233,7 @@ class Scene:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the content; two scenes with the same digest render the same pixels."""
+        """SHA-256 of the content; two with the same digest and model files give the same pixels."""
         return sha256_json(self.to_json())
 
     def effect(self, kind: str) -> EffectCall | None:

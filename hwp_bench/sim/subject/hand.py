@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,10 +23,11 @@ import numpy as np
 from hwp_bench.base.arrays import read_npz
 from hwp_bench.base.colors import srgb_to_linear
 from hwp_bench.base.errors import BadInput, HwpError
-from hwp_bench.base.files import atomic_write, cache_root, sha256_json
+from hwp_bench.base.files import atomic_write, cache_root, sha256_json, sha256_of
 from hwp_bench.base.numerics import kd_tree
 from hwp_bench.hands.poses import FIRST_JOINT
 from hwp_bench.hands.skeleton import FINGERS, PARENTS, SHAPE_COUNT
+from hwp_bench.hands.sources import template_files
 from hwp_bench.sim.geometry.noise import fractal_noise, generator
 from hwp_bench.sim.geometry.surface import (
     Material,
@@ -45,7 +47,8 @@ from hwp_bench.sim.hand.anatomy import (
     grown_nails,
     off_template,
 )
-from hwp_bench.sim.hand.rigs import load_rig, rig_path
+from hwp_bench.sim.hand.gltf import mesh_files
+from hwp_bench.sim.hand.rigs import FROM_FILE, load_rig, rig_path
 from hwp_bench.sim.subject.subject import PLAIN, Subject, without_defaults
 from hwp_bench.sim.subject.wear import SkinSample, _polished, gloved, tattoo_cover
 
@@ -371,6 +374,16 @@ def betas_of_joints(model: HandTemplate, joints: np.ndarray) -> np.ndarray:
 def is_off_template(subject: Subject) -> bool:
     """Whether no shape of the hand model is the subject's geometry."""
     return rig_path(subject.model) is not None or subject_anatomy(subject) is not None
+
+
+def model_digests(subject: Subject) -> list[str]:
+    """SHA-256 of the user's files that a subject's hands are read from; none of those that ship."""
+    model = subject.model
+    if model.startswith(FROM_FILE):
+        files = mesh_files(Path(model.removeprefix(FROM_FILE)))
+    else:
+        files = template_files(model)
+    return [sha256_of(file) for file in files]
 
 
 def subject_anatomy(subject: Subject) -> SubjectAnatomy | None:

@@ -5,6 +5,7 @@ Oracle: the hand model itself, posed with the true parameters, projected and fil
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +19,7 @@ from synthetic_mano import write_mirrored_mano
 from hwp_bench.base.errors import BadHandModel
 from hwp_bench.capture import Capture
 from hwp_bench.hands import load_template, pose_hand, project
-from hwp_bench.sim.produce.capture import render_capture
+from hwp_bench.sim.produce.capture import render_capture, render_key
 from hwp_bench.sim.scene.scene import Scene
 from hwp_bench.sim.subject.hand import skin_atlas, subject_hand
 
@@ -64,6 +65,9 @@ def test_the_subject_is_the_model_in_the_true_pose(
     template = load_template(model, "right")
     assert capture.info.hand_model.digest == template.digest
     assert capture.info.hand_model.source == model
+    files = [Path(model.removeprefix("mano:")) / f"MANO_{side}.pkl" for side in ("RIGHT", "LEFT")]
+    digests = [hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
+    assert capture.info.source["model_files"] == digests
     last = FRAMES - 1
     shown = capture.true_mask(last) > 127
     expected = _silhouette(capture, last, "right")
@@ -93,6 +97,19 @@ def test_both_hands_are_the_model(
     for side in ("right", "left"):
         expected = _silhouette(capture, 0, side)
         assert (shown & expected).sum() / expected.sum() > 0.7
+
+
+def test_another_file_in_the_same_place_is_another_render(
+    tmp_path: Path, make_scene: Callable[..., Scene]
+) -> None:
+    scene = make_scene()
+    folder = write_mirrored_mano(tmp_path / "mano")
+    for model in (f"mano:{folder}", f"mano-hd:{folder}"):
+        scene = replace(scene, subject=replace(scene.subject, model=model))
+        before = render_key(scene, FRAMES, SIZE)
+        assert render_key(scene, FRAMES, SIZE) == before
+        (folder / "MANO_RIGHT.pkl").write_bytes(model.encode())
+        assert render_key(scene, FRAMES, SIZE) != before
 
 
 def test_a_missing_model_is_one_clear_error(
