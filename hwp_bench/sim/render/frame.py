@@ -234,7 +234,7 @@ class Window:
         return hands
 
     def view(self, s: float) -> np.ndarray:
-        """(4, 4) world to camera."""
+        """(4, 4) world to camera; shaking shifts it, and only turns move the backdrop."""
         view = viewmat(self.scene, self.seconds(s))
         if self.shutter is not None:
             view[:2, 3] += s * self._width * np.array(self.shutter.camera)
