@@ -68,13 +68,14 @@ class Placement:
 
 @dataclass(frozen=True)
 class Shutter:
-    """How hands and image move while the shutter is open."""
+    """How hands and camera move while the shutter is open."""
 
     #: How long it is open, s.
     seconds: float
     #: Way of the hands across the image in that time, fraction of the image's width.
     hand: tuple[float, float]
-    #: Way of the whole image, likewise.
+    #: Way that a shift of the camera adds to hands and objects, likewise; the backdrop is far away
+    #: and stays.
     camera: tuple[float, float]
     #: Turn of the hands about the viewing axis, degrees.
     twist: float
@@ -283,7 +284,8 @@ class ObjectInteraction(Effect):
 class Illumination(Effect):
     """Exposure, colour temperature, direction of the lamps, flicker, a passing shadow.
 
-    Strength 1 halves or doubles the exposure, or does its equal in colour or direction.
+    Strength 1 halves the exposure or raises it by 62 %, or does its equal in colour or direction.
+    `move` and `shadow` are of the key light and the lamps; sky and walls stay.
     """
 
     name = "illumination"
@@ -358,7 +360,8 @@ class MotionBlur(Effect):
 
     #: How long the shutter is open, s.
     shutter: float = number(0.02, 0.001, 0.5)
-    #: Way of the whole image, as a share of the hands' way.
+    #: Way that a shift of the camera adds to hands and objects, as a share of the hands' way; the
+    #: backdrop is far away and stays.
     camera_share: float = number(0.0, 0.0, 1.0)
 
     def open_shutter(self, scene: Scene, seconds: float, strength: float) -> Shutter | None:
@@ -400,6 +403,20 @@ def check_hands(found: Iterable[tuple[str, str]], scene: Scene, path: str, where
             )
 
 
+def check_modes(effect: Effect, call: EffectCall, scene: Scene, where: str) -> None:
+    """Refuse modes of an illumination that do nothing to the light of the scene."""
+    if not isinstance(effect, Illumination) or scene.light.key or scene.light.lamps:
+        return
+    for mode in ("move", "shadow"):
+        if mode in effect.modes[: len(call.episodes)]:
+            raise BadInput(
+                f"{mode!r} changes the key light and lamps, and the scene has neither",
+                where=where,
+                field=f"effects({call.kind}).modes",
+                remedy="Give the scene's light a key or lamps, or choose other modes.",
+            )
+
+
 #: Longest way between two sub-frames, in pixels.
 SUBFRAME_STEP = 1.5
 #: Most sub-frames of a frame.
@@ -437,7 +454,7 @@ def shown_in(scene: Scene, frame: int, frame_count: int) -> Scene:
     """The scene of a frame: without effects in the first validation frame.
 
     It comes before `CLEAN_FROM`, so that an episode may reach into it, where the number of frames
-    is no multiple of five.
+    is not a multiple of five.
     """
     first, _ = contiguous_split(scene.id, frame_count).validation_range
     early = frame == first and first / frame_count < CLEAN_FROM

@@ -185,6 +185,11 @@ def test_nothing_acts_in_validation_and_test(name: str) -> None:
         ("[[0.3, 0.4, 3]]", "[[0.4, 0.3, 3]]", "effects[1].episodes"),
         ("[[0.3, 0.4, 3]]", "[[0.3, 0.9, 3]]", "effects[1].episodes"),
         ("[[0.3, 0.4, 3]]", "[[0.7, 0.8, 3]]", "effects[1].episodes"),
+        ("[[0.3, 0.4, 3]]", "[[0.35, 0.4, 3], [0.3, 0.36, 2]]", "effects[1].episodes"),
+        ("age = 31.0", 'age = 31.0\nmodel = "gtlf:hand.glb"', "subject.model"),
+        ("age = 31.0", 'age = 31.0\nmodel = "gltf:"', "subject.model"),
+        ("age = 31.0", 'age = 31.0\nmodel = "rig:nobody"', "subject.model"),
+        ("age = 31.0", "age = 31.0\nsleeve = [-1.0, 0.5, 0.4]", "subject.sleeve[0]"),
         ("[[0.3, 0.4, 3]]", "[[0.21, 0.79, 3]]", "effects"),
         ('object = "block"', 'object = "brick"', "object"),
         ('anchor = "right"', 'anchor = "left"', "anchor"),
@@ -197,6 +202,26 @@ def test_damage_is_named(make_scene: SceneMaker, old: str, new: str, field: str)
         make_scene((old, new))
     assert caught.value.where == "tiny.toml"
     assert field in str(caught.value)
+
+
+def test_a_light_that_does_nothing_is_refused(make_scene: SceneMaker) -> None:
+    # Neither key light nor lamps: of the default modes, move comes third.
+    dark = ("key = 0.6", "key = 0.0")
+    two, three = (
+        ("[[0.3, 0.4, 3]]", f"[[0.3, 0.33, 3], [0.35, 0.37, 3]{more}]")
+        for more in ("", ", [0.38, 0.4, 3]")
+    )
+    make_scene(dark, two)
+    with pytest.raises(BadInput, match=r"effects\(illumination\)\.modes: 'move' changes the key"):
+        make_scene(dark, three)
+    lamp = "[[light.lamps]]\nplace = [1.0, 0.0, 0.0]\nstrength = 1.0\n[track]"
+    make_scene(dark, three, ("[track]", lamp))
+
+
+def test_a_clean_share_just_too_small_is_shown_as_such(make_scene: SceneMaker) -> None:
+    # 700 of the 2,001 moments at which it is measured: 34.98 %, less than 35 %.
+    with pytest.raises(BadInput, match=r"only 34\.98% of the training part"):
+        make_scene(("[[0.3, 0.4, 3]]", "[[0.2502, 0.62, 3]]"))
 
 
 #: Tables with a field at fault: what stands before `[track]`, and the field.
