@@ -89,7 +89,7 @@ def measure_cost(repeats: int, size: int) -> None:
 def _painting(scene: Scene) -> float:
     start = time.process_time()
     subject = of_side(scene.subject, "right")
-    skin_atlas(subject)
+    skin_atlas(subject, "right")
     if subject.looks.arm == "bare":
         arm_atlas(subject)
     return time.process_time() - start

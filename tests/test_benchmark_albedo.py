@@ -23,7 +23,7 @@ ANCHORS = sample_surface(TEMPLATE, 5000)
 def test_the_true_albedo_is_that_of_the_atlas() -> None:
     """Anchors lie between the atlas's texels of 0.25 mm, so fine marks differ a little."""
     found = albedo.true_albedo(SUBJECT, "right", ANCHORS)[0]
-    painted = skin_atlas(SUBJECT).albedo
+    painted = skin_atlas(SUBJECT, "right").albedo
     corners = TEMPLATE.uv[TEMPLATE.face_uv][ANCHORS.face_index]
     u, v = np.einsum("nk,nkc->cn", ANCHORS.barycentric, corners)
     height, width = painted.shape[:2]

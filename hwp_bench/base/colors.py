@@ -40,7 +40,8 @@ def log_light(srgb: np.ndarray, floor: float) -> np.ndarray:
 def lamp_color(kelvin: float) -> np.ndarray:
     """Linear sRGB colour of a black body, scaled to luminance 1 and relative to 5500 K.
 
-    Source: a power law through the Planckian locus in linear sRGB, within 10 % of it.
+    Source: a power law through the Planckian locus in linear sRGB, within 10 % of it from 4,600 to
+    12,000 K. Warmer lamps come out less warm: one of 3,000 K as one of about 3,800 K.
     """
     ratio = kelvin / 5500.0
     color = np.array([ratio**-0.55, 1.0, ratio**0.75])

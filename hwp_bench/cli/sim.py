@@ -258,10 +258,11 @@ def _changed(
 ) -> Scene:
     from hwp_bench.sim.scene.scene import with_clean_share, with_severity, with_subject
 
-    if share is not None:
-        scene = with_clean_share(scene, share)
     if severity is not None:
         scene = with_severity(scene, severity)
+    # After the severity: ends of mild episodes are clean.
+    if share is not None:
+        scene = with_clean_share(scene, share)
     if subject is not None:
         scene = with_subject(scene, subject)
     return scene

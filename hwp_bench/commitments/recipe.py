@@ -18,7 +18,7 @@ from msgspec import Meta
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.files import canonical_json, read_json, write_json
 from hwp_bench.base.records import MAX_SEED, Digest, Line, Record, parse_record, without_schema
-from hwp_bench.sim.produce.capture import RENDERER, SuiteItem, suite
+from hwp_bench.sim.produce.capture import FRAMES, RENDERER, SIZES, SuiteItem, suite
 from hwp_bench.sim.scene.scene import Scene, with_subject
 from hwp_bench.sim.scene_files import known_scenes, load_scene
 
@@ -97,7 +97,7 @@ class RecipeScene:
     #: Digest of the scene as it is public.
     digest: Digest
     #: Frames over which it is spread.
-    frames: Annotated[int, Meta(ge=10, le=100_000)]
+    frames: Annotated[int, Meta(ge=FRAMES[0], le=FRAMES[1])]
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class SealedRecipe:
 
     #: Its scenes, each once.
     scenes: Annotated[tuple[RecipeScene, ...], Meta(min_length=1, max_length=MAX_CAPTURES)]
-    size: Annotated[int, Meta(ge=16, le=4096)]
+    size: Annotated[int, Meta(ge=SIZES[0], le=SIZES[1])]
     renderer: Annotated[int, Meta(ge=1, le=10**6)] = RENDERER
 
     def __post_init__(self) -> None:
@@ -137,10 +137,9 @@ class SealedRecipe:
 
 def recipe_of(names: Sequence[str], frames: int, size: int) -> SealedRecipe:
     """Make a recipe of scenes that come with the package."""
-    if not 10 <= frames <= 100_000:
-        raise UsageError(f"{frames} is not from 10 to 100000", field="--frame-count")
-    if not 16 <= size <= 4096:
-        raise UsageError(f"{size} is not from 16 to 4096", field="--size")
+    for flag, value, (low, high) in (("--frame-count", frames, FRAMES), ("--size", size, SIZES)):
+        if not low <= value <= high:
+            raise UsageError(f"{value} is not from {low} to {high}", field=flag)
     if not 1 <= len(names) <= MAX_CAPTURES:
         raise UsageError(f"{len(names)} scenes are not from 1 to {MAX_CAPTURES}", field="SCENE")
     known = set(known_scenes())

@@ -36,7 +36,7 @@ _MEAN_KEPT, _SQUARE_KEPT = 0.9, 0.99
 class FitTargets:
     """The known points of one hand in F frames, in the coordinate frame of `transl`; metres.
 
-    At least one of the three must be known; NaN marks unknown values.
+    Landmarks or skin must be known; NaN marks unknown values.
     """
 
     #: (F, 21, 3) landmarks, OpenPose order.

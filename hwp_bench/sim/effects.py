@@ -18,11 +18,13 @@ from msgspec import Meta
 from hwp_bench.base.colors import lamp_color
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.records import number, parse_record
+from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.sim.geometry.noise import generator
 from hwp_bench.sim.geometry.surface import rigid, unit
 from hwp_bench.sim.light.lights import CastShadow, Lights, steady_light
 from hwp_bench.sim.props.objects import check_object
 from hwp_bench.sim.scene.scene import (
+    CLEAN_FROM,
     EffectCall,
     Episode,
     HandKey,
@@ -66,13 +68,14 @@ class Placement:
 
 @dataclass(frozen=True)
 class Shutter:
-    """How hands and image move while the shutter is open."""
+    """How hands and camera move while the shutter is open."""
 
     #: How long it is open, s.
     seconds: float
     #: Way of the hands across the image in that time, fraction of the image's width.
     hand: tuple[float, float]
-    #: Way of the whole image, likewise.
+    #: Way that a shift of the camera adds to hands and objects, likewise; the backdrop is far away
+    #: and stays.
     camera: tuple[float, float]
     #: Turn of the hands about the viewing axis, degrees.
     twist: float
@@ -281,7 +284,8 @@ class ObjectInteraction(Effect):
 class Illumination(Effect):
     """Exposure, colour temperature, direction of the lamps, flicker, a passing shadow.
 
-    Strength 1 halves or doubles the exposure, or does its equal in colour or direction.
+    Strength 1 halves the exposure or raises it by 62 %, or does its equal in colour or direction.
+    `move` and `shadow` are of the key light and the lamps; sky and walls stay.
     """
 
     name = "illumination"
@@ -302,7 +306,9 @@ class Illumination(Effect):
     ) -> Lights:
         """Change the light as the mode of the episode says."""
         moment = seconds / scene.duration
-        number = next((i for i, e in enumerate(call.episodes) if e.start <= moment <= e.end), 0)
+        # The nearest: rounding may put the moment of an episode's end outside of it.
+        away = [max(part.start - moment, moment - part.end, 0.0) for part in call.episodes]
+        number = away.index(min(away))
         mode = self.modes[number % len(self.modes)]
         if mode in ("dim", "bright"):
             stops = -1.0 if mode == "dim" else 0.7
@@ -354,7 +360,8 @@ class MotionBlur(Effect):
 
     #: How long the shutter is open, s.
     shutter: float = number(0.02, 0.001, 0.5)
-    #: Way of the whole image, as a share of the hands' way.
+    #: Way that a shift of the camera adds to hands and objects, as a share of the hands' way; the
+    #: backdrop is far away and stays.
     camera_share: float = number(0.0, 0.0, 1.0)
 
     def open_shutter(self, scene: Scene, seconds: float, strength: float) -> Shutter | None:
@@ -396,6 +403,20 @@ def check_hands(found: Iterable[tuple[str, str]], scene: Scene, path: str, where
             )
 
 
+def check_modes(effect: Effect, call: EffectCall, scene: Scene, where: str) -> None:
+    """Refuse modes of an illumination that do nothing to the light of the scene."""
+    if not isinstance(effect, Illumination) or scene.light.key or scene.light.lamps:
+        return
+    for mode in ("move", "shadow"):
+        if mode in effect.modes[: len(call.episodes)]:
+            raise BadInput(
+                f"{mode!r} changes the key light and lamps, and the scene has neither",
+                where=where,
+                field=f"effects({call.kind}).modes",
+                remedy="Give the scene's light a key or lamps, or choose other modes.",
+            )
+
+
 #: Longest way between two sub-frames, in pixels.
 SUBFRAME_STEP = 1.5
 #: Most sub-frames of a frame.
@@ -429,6 +450,17 @@ class FramePlan:
         return any(name in self.passes for name in ("objects", "light", "shutter"))
 
 
+def shown_in(scene: Scene, frame: int, frame_count: int) -> Scene:
+    """The scene of a frame: without effects in the first validation frame.
+
+    It comes before `CLEAN_FROM`, so that an episode may reach into it, where the number of frames
+    is not a multiple of five.
+    """
+    first, _ = contiguous_split(scene.id, frame_count).validation_range
+    early = frame == first and first / frame_count < CLEAN_FROM
+    return replace(scene, effects=()) if early else scene
+
+
 def plan_frame(
     scene: Scene,
     frame: int,
@@ -437,6 +469,8 @@ def plan_frame(
     strengths: Mapping[str, float] | None = None,
 ) -> FramePlan:
     """Plan one frame."""
+    absent = {call.kind: 0 for call in scene.effects}
+    scene = shown_in(scene, frame, frame_count)
     moment = float(moments(frame_count)[frame])
     seconds = moment * scene.duration
     acting = {
@@ -464,7 +498,7 @@ def plan_frame(
     return FramePlan(
         frame=frame,
         seconds=seconds,
-        severity={call.kind: severity(call, moment) for call in scene.effects},
+        severity=absent | {call.kind: severity(call, moment) for call in scene.effects},
         strength=acting,
         subframes=subframes,
         shutter=shutter,

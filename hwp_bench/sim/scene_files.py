@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
@@ -12,7 +13,7 @@ from msgspec import Meta
 
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.records import MAX_CHARACTERS, parse_record, parse_toml
-from hwp_bench.sim.effects import check_hands, read_effect
+from hwp_bench.sim.effects import check_hands, check_modes, read_effect
 from hwp_bench.sim.props.behind import check_backdrop
 from hwp_bench.sim.scene.scene import (
     CLEAN_FROM,
@@ -158,15 +159,23 @@ class _EffectTable:
         if not self.episodes:
             raise UsageError("is empty", field="episodes")
         for start, end, severity in self.episodes:
-            if not 0.0 <= start < end <= CLEAN_FROM:
+            if not 0.0 <= start < end < CLEAN_FROM:
                 raise UsageError(
-                    f"[{start}, {end}] does not lie in order within 0 and {CLEAN_FROM}",
+                    f"[{start}, {end}] does not lie in order from 0 to below {CLEAN_FROM}",
                     field="episodes",
                     remedy="The last fifth (validation and test) stays clean.",
                 )
             if not 1.0 <= severity <= MAX_SEVERITY:
                 raise UsageError(
                     f"severity {severity} is not in 1..{MAX_SEVERITY}", field="episodes"
+                )
+        parts = sorted(self.episodes)
+        for before, after in itertools.pairwise(parts):
+            if after[0] < before[1]:
+                raise UsageError(
+                    f"{list(before)} and {list(after)} overlap",
+                    field="episodes",
+                    remedy="Make one episode of them, or shorten one.",
                 )
         values = list(self.strengths or ())
         if sorted(values) != values:
@@ -191,12 +200,13 @@ def _check_effects(scene: Scene, where: str) -> None:
     if len(set(kinds)) != len(kinds):
         raise BadInput("an effect is called twice", where=where, field="effects")
     for call in scene.effects:
-        named = read_effect(call, where).named_hands()
-        check_hands(named, scene, f"effects({call.kind})", where)
+        effect = read_effect(call, where)
+        check_hands(effect.named_hands(), scene, f"effects({call.kind})", where)
+        check_modes(effect, call, scene, where)
     share = clean_share(scene)
     if scene.clean_share is None and share < MIN_CLEAN_SHARE:
         raise BadInput(
-            f"only {share:.0%} of the training part is unperturbed, at least "
+            f"only {share:.2%} of the training part is unperturbed, at least "
             f"{MIN_CLEAN_SHARE:.0%} must be",
             where=where,
             field="effects",

@@ -44,7 +44,8 @@ class AutoControl:
 class Sensor:
     """The sensor: light becomes a stored image, in the same way for a clean version."""
 
-    #: Standard deviation of the noise at mid grey, of 1.
+    #: Standard deviation of the noise of white, in linear light in which white is 1; darker pixels
+    #: have less, by the square root of their light.
     noise: Annotated[float, Meta(ge=0.0, le=0.2)]
     #: Quality of the JPEG that the device stores, 1-100; 0 stores without loss.
     jpeg_quality: int = number(0, 0, 100)

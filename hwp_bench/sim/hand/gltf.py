@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import base64
 import binascii
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -23,6 +23,8 @@ from hwp_bench.base.files import inside
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
+
+_Found = TypeVar("_Found")
 
 #: Largest file that is read, in bytes.
 MAX_BYTES = 256 * 1024 * 1024
@@ -99,9 +101,18 @@ class SkinnedMesh:
 
 def read_skinned_mesh(path: Path) -> SkinnedMesh:
     """Read everything that a file's skins and joints move."""
+    return _guarded(path, _read)
+
+
+def mesh_files(path: Path) -> list[Path]:
+    """The files that a mesh is read from: its own, and those of its buffers and images."""
+    return _guarded(path, _Gltf.files)
+
+
+def _guarded(path: Path, read: Callable[[_Gltf], _Found]) -> _Found:
     try:
         with np.errstate(all="ignore"):
-            return _read(_Gltf(path))
+            return read(_Gltf(path))
     except BadHandModel:
         raise
     except Exception as error:
@@ -178,6 +189,12 @@ class _Gltf:
         if max(pixels.shape) > MAX_TEXTURE:
             raise self.wrong(f"holds a texture of {max(pixels.shape)} px, at most {MAX_TEXTURE}")
         return np.ascontiguousarray(pixels[..., ::-1])
+
+    def files(self) -> list[Path]:
+        """The file, and the others that it names and that are there."""
+        uris = [part.uri for part in (*self.content.buffers, *self.content.images) if part.uri]
+        named = [inside(self.path.parent, uri) for uri in uris if not uri.startswith("data:")]
+        return [self.path, *(file for file in named if file.is_file())]
 
     def chain(self, node: int) -> list[int]:
         """A node and all nodes above it, lowest first."""

@@ -479,7 +479,7 @@ def rig_path(model: str) -> str | None:
     if name not in known:
         raise UsageError(
             f"there is no rig {name!r}",
-            field="subject.model",
+            field="model",
             remedy=f"Known: {', '.join(known)}; or gltf: and the path of a file.",
         )
     return known[name]

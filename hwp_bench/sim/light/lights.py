@@ -96,8 +96,8 @@ class Light:
 #: Distance of the backdrop behind the point looked at, m, for the light that falls on it.
 BACKDROP_DISTANCE = 1.0
 #: Share of a cube's face that a patch in its middle sees of the side it faces, and of each side
-#: that borders it; the sixth lies behind. Source: view factor of a square from the centre of the
-#: opposite face, (4 / pi) / sqrt(2) * atan(1 / sqrt(2)) = 0.5541, and a quarter of the rest.
+#: that borders it; the sixth lies behind. Source: view factor of a face from the middle of the
+#: cube, (4 / pi) / sqrt(2) * atan(1 / sqrt(2)) = 0.5541, and a quarter of the rest.
 FACING_SHARE = float(4.0 / np.pi / np.sqrt(2.0) * np.arctan(1.0 / np.sqrt(2.0)))
 BORDER_SHARE = (1.0 - FACING_SHARE) / 4.0
 
@@ -201,11 +201,11 @@ class CastShadow:
     edge: float
     #: Width of the edge, m.
     width: float
-    #: Share of the key light that is lost inside, 0-1.
+    #: Share of the light of key light and lamps that is lost inside, 0-1.
     depth: float
 
     def passed(self, points: np.ndarray) -> np.ndarray:
-        """Share of the key light that passes at (N, 3) points: (N,)."""
+        """Share of that light that passes at (N, 3) points: (N,)."""
         x = np.clip((points @ self.across - self.edge) / self.width + 0.5, 0.0, 1.0)
         return 1.0 - self.depth * x * x * (3.0 - 2.0 * x)
 

@@ -39,7 +39,7 @@ from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.run.engine import Engine, Job, LocalEngine, Needs
 from hwp_bench.run.engine.job import OnProgress, ignore_progress
 from hwp_bench.run.engine.processes import THREADS, LocalJob, Stopped, WorkerLost, run_in_process
-from hwp_bench.sim.effects import FramePlan, hands_at, plan_frame
+from hwp_bench.sim.effects import FramePlan, hands_at, plan_frame, shown_in
 from hwp_bench.sim.hand.rigs import rig_path
 from hwp_bench.sim.produce.estimates import confused_mask, estimate_hands, estimate_mask
 from hwp_bench.sim.produce.free_view import FRAMES as FREE_FRAMES
@@ -63,7 +63,7 @@ from hwp_bench.sim.scene.scene import (
 )
 from hwp_bench.sim.scene_files import load_scene, scene_names
 from hwp_bench.sim.sensor import check_encoder, through_h264
-from hwp_bench.sim.subject.hand import of_side, skin_atlas
+from hwp_bench.sim.subject.hand import model_digests, of_side, skin_atlas
 
 #: Version of the pixels that the renderer makes; part of every render key.
 RENDERER = 10
@@ -93,7 +93,8 @@ def check_extent(frame_count: int, size: int, workers: int | None = None) -> Non
 
 def render_key(scene: Scene, frame_count: int, size: int) -> str:
     """Digest of everything that decides the pixels of a capture."""
-    return sha256_json([RENDERER, scene.digest, frame_count, size])
+    files = model_digests(scene.subject)
+    return sha256_json([RENDERER, scene.digest, frame_count, size, *files])
 
 
 @dataclass(frozen=True)
@@ -275,7 +276,7 @@ def _render_missing(request: RenderRequest, waiting: Path, on_progress: OnProgre
     # Built once here, so that no two processes paint the same skin.
     scene_hands(scene)
     for side in scene.sides:
-        skin_atlas(of_side(scene.subject, side))
+        skin_atlas(of_side(scene.subject, side), side)
     workers = request.workers
     if workers is None:
         workers = max(1, min(os.cpu_count() or 1, left // _FRAMES_PER_WORKER))
@@ -460,11 +461,13 @@ def _waiting_frame(waiting: Path, frame: int) -> dict[str, np.ndarray]:
 
 def true_hands(scene: Scene, plans: list[FramePlan]) -> dict[str, HandParameters]:
     """The true hand parameters of every frame, by side."""
-    return parameters_of(scene, [hands_at(scene, item.seconds) for item in plans])
+    count = len(plans)
+    moments = [hands_at(shown_in(scene, item.frame, count), item.seconds) for item in plans]
+    return parameters_of(scene, moments)
 
 
 def _info(scene: Scene, plans: list[FramePlan], size: int) -> CaptureInfo:
-    model = scene_hands(scene)[scene.sides[0]].model
+    model, files = scene_hands(scene)[scene.sides[0]].model, model_digests(scene.subject)
     known = "anny" if rig_path(scene.subject.model) is not None else scene.subject.model
     return CaptureInfo(
         id=scene.id,
@@ -487,6 +490,7 @@ def _info(scene: Scene, plans: list[FramePlan], size: int) -> CaptureInfo:
             "seed": scene.seed,
             "renderer": RENDERER,
             **({} if scene.clean_share is None else {"clean_share": scene.clean_share}),
+            **({"model_files": files} if files else {}),
         },
         licence=LICENCE,
     )

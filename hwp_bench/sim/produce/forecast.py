@@ -10,12 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from hwp_bench.base.tables import Cell, Column, Table
+from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.sim.effects import ORDER, FramePlan, plan_frame
 from hwp_bench.sim.geometry.surface import RenderCost
 from hwp_bench.sim.produce.capture import check_extent
 from hwp_bench.sim.produce.free_view import FRAMES, free_views, render_free
 from hwp_bench.sim.render.frame import carry_out, steady_gain
-from hwp_bench.sim.scene.scene import CLEAN_FROM, Scene, clean_share, moments
+from hwp_bench.sim.scene.scene import Scene, clean_share
 from hwp_bench.sim.sensor import through_h264
 
 # Joins the names of effects that act in the same frame.
@@ -90,6 +91,7 @@ def forecast(
     edge = 256 if size is None else size
     check_extent(count, edge)
     plans = [plan_frame(scene, frame, count, edge) for frame in range(count)]
+    train = contiguous_split(scene.id, count).train
     groups: dict[str, list[FramePlan]] = {}
     for item in plans:
         groups.setdefault(group_name(item), []).append(item)
@@ -105,10 +107,7 @@ def forecast(
         seconds=seconds,
         rays=rays,
         clean_share=round(clean_share(scene), 4),
-        clean_frames=sum(
-            not item.strength and moment < CLEAN_FROM
-            for item, moment in zip(plans, moments(count).tolist(), strict=True)
-        ),
+        clean_frames=sum(not plans[frame].strength for frame in train.tolist()),
         free_seconds=free_seconds,
         free_rays=free_rays,
     )

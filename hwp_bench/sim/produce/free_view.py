@@ -343,9 +343,9 @@ def render_free(
     Where the hand is hidden, by the sleeve or by what is worn, the camera moves towards the
     fingers until some of it is seen.
     """
-    for _ in range(_MOVES):
+    for move in range(_MOVES + 1):
         rgb, coverage = render_view(scene, item.hands, item.view, size, gain, cost)
-        if (eight_bit_coverage(coverage) == 255).mean() >= LEAST_HAND:
+        if move == _MOVES or (eight_bit_coverage(coverage) == 255).mean() >= LEAST_HAND:
             break
         axes = hand_axes(item.hands)
         towards = -item.view[2, :3] @ axes

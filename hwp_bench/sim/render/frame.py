@@ -22,7 +22,15 @@ import numpy as np
 
 from hwp_bench.base.colors import LUMINANCE, eight_bit_srgb
 from hwp_bench.base.errors import HwpError
-from hwp_bench.sim.effects import FramePlan, Shutter, hands_at, lights_at, objects_at, plan_frame
+from hwp_bench.sim.effects import (
+    FramePlan,
+    Shutter,
+    hands_at,
+    lights_at,
+    objects_at,
+    plan_frame,
+    shown_in,
+)
 from hwp_bench.sim.geometry.noise import generator
 from hwp_bench.sim.geometry.surface import RenderCost, Surface, Tracer, join, transformed
 from hwp_bench.sim.light.lights import FOCUS_DISTANCE, steady_light
@@ -226,7 +234,7 @@ class Window:
         return hands
 
     def view(self, s: float) -> np.ndarray:
-        """(4, 4) world to camera."""
+        """(4, 4) world to camera; shaking shifts it, and only turns move the backdrop."""
         view = viewmat(self.scene, self.seconds(s))
         if self.shutter is not None:
             view[:2, 3] += s * self._width * np.array(self.shutter.camera)
@@ -339,7 +347,7 @@ def render_frame(scene: Scene, frame: int, frame_count: int, size: int) -> Simul
         size: edge of the image in pixels.
     """
     recipe = plan_frame(scene, frame, frame_count, size)
-    return carry_out(scene, recipe, size)
+    return carry_out(shown_in(scene, frame, frame_count), recipe, size)
 
 
 def carry_out(scene: Scene, recipe: FramePlan, size: int) -> SimulatedFrame:
@@ -446,6 +454,8 @@ _OBJECT = 4
 def frame_layers(scene: Scene, result: SimulatedFrame, frame_count: int, size: int) -> np.ndarray:
     """Compute the layers of a frame: (S, S, 10) float32 in the order of `CHANNELS`."""
     recipe = result.plan
+    next_scene = shown_in(scene, recipe.frame + 1, frame_count)
+    scene = shown_in(scene, recipe.frame, frame_count)
     stage = RenderStage(scene, RenderCost())
     seconds = recipe.seconds
     later = seconds + scene.duration / frame_count
@@ -455,7 +465,7 @@ def frame_layers(scene: Scene, result: SimulatedFrame, frame_count: int, size: i
     body = stage.traced(stage.surface(hands))
     things = stage.things(objects_at(scene, recipe, seconds), hands)
     image = render_instant(scene, lens, body, things, lights_at(scene, recipe), RenderCost())
-    future_hands = hands_at(scene, later)
+    future_hands = hands_at(next_scene, later)
     now, then = body.surface, stage.surface(future_hands)
     owner = stage.owners(hands)
     if things is not None:

@@ -60,7 +60,7 @@ def _hand_surface(
     vertices, normals = hand.pose(pose, transl)
     skin = hand.own_skin
     if skin is None:
-        skin = skin_atlas(of_side(subject, side))
+        skin = skin_atlas(of_side(subject, side), side)
     surface = Surface(
         vertices=vertices,
         normals=normals,

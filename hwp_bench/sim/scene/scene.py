@@ -233,7 +233,7 @@ class Scene:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the content; two scenes with the same digest render the same pixels."""
+        """SHA-256 of the content; two with the same digest and model files give the same pixels."""
         return sha256_json(self.to_json())
 
     def effect(self, kind: str) -> EffectCall | None:
@@ -249,7 +249,7 @@ def with_severity(scene: Scene, severity: float) -> Scene:
     for call in scene.effects:
         episodes = tuple(replace(part, severity=float(severity)) for part in call.episodes)
         effects.append(replace(call, episodes=episodes))
-    return replace(scene, effects=tuple(effects))
+    return _as_stated(replace(scene, effects=tuple(effects)))
 
 
 def with_subject(scene: Scene, seed: int) -> Scene:
@@ -271,11 +271,20 @@ def with_subject(scene: Scene, seed: int) -> Scene:
 
 def with_effects(scene: Scene, kinds: Collection[str]) -> Scene:
     """The scene with only some of its effects."""
-    return replace(scene, effects=tuple(call for call in scene.effects if call.kind in kinds))
+    kept = tuple(call for call in scene.effects if call.kind in kinds)
+    return _as_stated(replace(scene, effects=kept))
 
 
 # How far the share may be off that was asked for: ends of mild episodes round to severity 0.
 _SHARE_SLACK = 0.01
+
+
+def _as_stated(scene: Scene) -> Scene:
+    """The scene, which states its clean share only where that is true."""
+    stated = scene.clean_share
+    if stated is None or abs(clean_share(scene) - stated) <= _SHARE_SLACK:
+        return scene
+    return replace(scene, clean_share=None)
 
 
 def with_clean_share(scene: Scene, share: float) -> Scene:

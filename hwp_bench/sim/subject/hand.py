@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,10 +23,11 @@ import numpy as np
 from hwp_bench.base.arrays import read_npz
 from hwp_bench.base.colors import srgb_to_linear
 from hwp_bench.base.errors import BadInput, HwpError
-from hwp_bench.base.files import atomic_write, cache_root, sha256_json
+from hwp_bench.base.files import atomic_write, cache_root, sha256_json, sha256_of
 from hwp_bench.base.numerics import kd_tree
 from hwp_bench.hands.poses import FIRST_JOINT
 from hwp_bench.hands.skeleton import FINGERS, PARENTS, SHAPE_COUNT
+from hwp_bench.hands.sources import template_files
 from hwp_bench.sim.geometry.noise import fractal_noise, generator
 from hwp_bench.sim.geometry.surface import (
     Material,
@@ -45,7 +47,8 @@ from hwp_bench.sim.hand.anatomy import (
     grown_nails,
     off_template,
 )
-from hwp_bench.sim.hand.rigs import load_rig, rig_path
+from hwp_bench.sim.hand.gltf import mesh_files
+from hwp_bench.sim.hand.rigs import FROM_FILE, load_rig, rig_path
 from hwp_bench.sim.subject.subject import PLAIN, Subject, without_defaults
 from hwp_bench.sim.subject.wear import SkinSample, _polished, gloved, tattoo_cover
 
@@ -373,6 +376,16 @@ def is_off_template(subject: Subject) -> bool:
     return rig_path(subject.model) is not None or subject_anatomy(subject) is not None
 
 
+def model_digests(subject: Subject) -> list[str]:
+    """SHA-256 of the user's files that a subject's hands are read from; none of those that ship."""
+    model = subject.model
+    if model.startswith(FROM_FILE):
+        files = mesh_files(Path(model.removeprefix(FROM_FILE)))
+    else:
+        files = template_files(model)
+    return [sha256_of(file) for file in files]
+
+
 def subject_anatomy(subject: Subject) -> SubjectAnatomy | None:
     """How a subject differs from the hand model, or None if not at all."""
     anatomy = subject.anatomy
@@ -594,10 +607,21 @@ def skin_material(albedo: np.ndarray, height: np.ndarray, roughness: np.ndarray)
 
 
 @lru_cache(maxsize=4)
-def skin_atlas(subject: Subject) -> Material:
-    """Paint a subject's skin, or read it from the cache. Both hands share it, mirrored."""
-    hand = subject_hand(subject, "right")
+def skin_atlas(subject: Subject, side: str) -> Material:
+    """Paint the skin of one hand, or read it from the cache.
+
+    Both hands share it, mirrored, where they are laid out alike: those of MANO are not.
+    """
+    hand = subject_hand(subject, side)
+    if side == "left" and _laid_out_alike(hand, subject_hand(subject, "right")):
+        return skin_atlas(subject, "right")
     return kept(hand, subject, "", lambda: painted_atlas(hand, subject, ATLAS))
+
+
+def _laid_out_alike(one: SubjectHand, other: SubjectHand) -> bool:
+    """Whether each face of two hands has the same place in the atlas, up to corner order."""
+    corners, others = (np.sort(hand.template.face_uv, axis=1) for hand in (one, other))
+    return np.array_equal(corners, others) and np.array_equal(one.template.uv, other.template.uv)
 
 
 def kept(hand: SubjectHand, subject: Subject, part: str, paint: Callable[[], Material]) -> Material:

@@ -16,6 +16,7 @@ from hwp_bench.base.errors import ODD_CHARACTERS, UsageError
 from hwp_bench.base.records import Seed, number
 from hwp_bench.sim.geometry.surface import Color
 from hwp_bench.sim.hand.anatomy import SubjectAnatomy
+from hwp_bench.sim.hand.rigs import rig_path
 from hwp_bench.sim.subject.wear import Glove, Polish, Ring, Tattoo, WristWear
 
 
@@ -82,7 +83,6 @@ class Looks:
 PLAIN = Looks()
 
 
-_Share = Annotated[float, Meta(ge=-1.0, le=1.0)]
 #: A text with at least one visible character.
 Words = Annotated[
     str,
@@ -104,7 +104,7 @@ class Subject:
     #: Years; deepens creases, veins and tendons.
     age: Annotated[float, Meta(ge=5.0, le=100.0)]
     #: sRGB colour of the sleeve, 0-1 each.
-    sleeve: tuple[_Share, _Share, _Share] = (0.25, 0.3, 0.4)
+    sleeve: Color = (0.25, 0.3, 0.4)
     #: Surface: `anny` (the free hand), `mano:PATH` or `mano-hd:PATH` where the user has it, or
     #: `gltf:PATH`, a rigged hand, or `rig:NAME`, one that comes with the package.
     model: Words = "anny"
@@ -112,6 +112,17 @@ class Subject:
     looks: Looks = PLAIN
     #: Geometry that no shape of the model has; None for the model as it is.
     anatomy: SubjectAnatomy | None = None
+
+    def __post_init__(self) -> None:
+        kind, _, path = self.model.partition(":")
+        # A rig's name is checked where it is looked up.
+        if rig_path(self.model) or self.model == "anny" or (path and kind in ("mano", "mano-hd")):
+            return
+        raise UsageError(
+            f"is {self.model!r}",
+            field="model",
+            remedy="Use anny, mano:PATH, mano-hd:PATH, gltf:PATH or rig:NAME.",
+        )
 
 
 def without_defaults(record: Any, keep: tuple[str, ...] = ()) -> dict[str, Any]:

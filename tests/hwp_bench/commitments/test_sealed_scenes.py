@@ -122,7 +122,8 @@ def test_a_suite_gives_its_own_frames_and_size() -> None:
         (["capture99"], 20, 64, "capture99"),
         (["../capture2"], 20, 64, "not a scene"),
         (["capture2"], 9, 64, "--frame-count"),
-        (["capture2"], 20, 4097, "--size"),
+        (["capture2"], 20, 31, "31 is not from 32 to 1024"),
+        (["capture2"], 20, 1025, "--size"),
     ],
 )
 def test_recipes_that_nobody_could_check_are_refused(

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pygltflib
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -26,6 +27,7 @@ from benchmarks.rig_files import (
     write_rig,
 )
 from hwp_bench.base.errors import BadHandModel, UsageError
+from hwp_bench.base.files import sha256_json
 from hwp_bench.hands import HandTemplate, load_template
 from hwp_bench.hands.template import boundary_loop
 from hwp_bench.sim.hand.rigs import (
@@ -38,6 +40,7 @@ from hwp_bench.sim.hand.rigs import (
     outlines,
     rig_path,
 )
+from hwp_bench.sim.produce.capture import RENDERER, render_key
 from hwp_bench.sim.render.frame import render_frame
 from hwp_bench.sim.scene.scene import Scene
 
@@ -114,6 +117,29 @@ def test_a_scene_shows_the_rig(tmp_path: Path, make_scene: Callable[..., Scene])
     either = (result.coverage > 0.5) | (own.coverage > 0.5)
     # The subject's shape is not the rig's, but the pose is.
     assert both.sum() / either.sum() > 0.7
+
+
+def test_another_rig_in_the_same_place_is_another_render(
+    tmp_path: Path, make_scene: Callable[..., Scene]
+) -> None:
+    # The buffer lies in a file of its own, and only that one changes.
+    rig = pygltflib.GLTF2().load(str(rig_path("rig:generic-hand")))
+    (tmp_path / "hand.bin").write_bytes(rig.binary_blob())
+    rig.buffers[0].uri = "hand.bin"
+    rig.save_json(str(tmp_path / "hand.gltf"))
+    scene = make_scene(("age = 31.0", f'age = 31.0\nmodel = "gltf:{tmp_path / "hand.gltf"}"'))
+    before = render_key(scene, 10, 48)
+    assert render_key(scene, 10, 48) == before
+    with (tmp_path / "hand.bin").open("ab") as file:
+        file.write(b"\0")
+    assert render_key(scene, 10, 48) != before
+
+
+def test_what_ships_keeps_its_key(make_scene: Callable[..., Scene]) -> None:
+    # Oracle: the definition. Captures in caches are found by it.
+    for model in ("anny", "rig:generic-hand"):
+        scene = make_scene(("age = 31.0", f'age = 31.0\nmodel = "{model}"'))
+        assert render_key(scene, 10, 48) == sha256_json([RENDERER, scene.digest, 10, 48])
 
 
 def test_missing_joints_are_named(tmp_path: Path) -> None:

@@ -32,6 +32,7 @@ from hwp_bench.sim.light.lights import (
 from hwp_bench.sim.light.shading import GRIDS, SKIN_REACH, Samples, lamp_light, room_light
 from hwp_bench.sim.render.frame import render_frame
 from hwp_bench.sim.scene.scene import Scene
+from hwp_bench.sim.scene_files import load_scene
 from hwp_bench.sim.sensor import AutoControl, Sensor
 
 SceneMaker = Callable[..., Scene]
@@ -172,6 +173,21 @@ def test_a_scene_pays_for_what_it_asks(make_scene: SceneMaker) -> None:
     # A key light that is off casts no ray.
     off = replace(lit, light=replace(lit.light, key=0.0))
     assert render_frame(off, CLEAN, COUNT, SIZE).cost.rays["shadow"] == 0
+
+
+def test_the_first_moment_of_an_episode_has_its_own_mode() -> None:
+    # Frame 168 of 800 begins the second episode, at 0.21; as seconds over the duration it is a
+    # last bit earlier. Its mode, warm, tints the light; that of the first episode swings it.
+    scene = load_scene("wild-test-2")
+    call = scene.effect("illumination")
+    assert call is not None
+    assert call.episodes[1].start == 0.21
+    assert call.settings["modes"][:2] == ["move", "warm"]
+    recipe = plan_frame(scene, 168, 800, SIZE)
+    assert recipe.seconds / scene.duration < 0.21
+    lights, steady = lights_at(scene, recipe), steady_light(scene.light)
+    np.testing.assert_array_equal(lights.direction, steady.direction)
+    assert lights.key[0] / lights.key[2] > 1.02 * steady.key[0] / steady.key[2]
 
 
 def test_effects_change_lamps_too(make_scene: SceneMaker) -> None:

@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 from tiny_scene import SINGLE
 
+from hwp_bench.base.errors import UsageError
 from hwp_bench.cli.main import main
+from hwp_bench.cli.sim import _changed
 from hwp_bench.sim.produce.calibration import TARGETS, Calibration, calibrate, write_strengths
-from hwp_bench.sim.scene.scene import Scene
+from hwp_bench.sim.scene.scene import Scene, clean_share
 from hwp_bench.sim.scene_files import known_scenes, load_scene, scene_groups, scene_names
 
 SceneMaker = Callable[..., Scene]
@@ -45,6 +47,15 @@ def test_plan_counts_without_rendering(
     (report,) = json.loads(capsys.readouterr().out)
     assert report["passes"]["hands"] == 40
     assert report["seconds"] is None
+
+
+def test_the_clean_share_is_that_of_the_severity_asked_for() -> None:
+    # Oracle: the share as it is measured.
+    scene = _changed(load_scene("persistent-2"), 0.3, 2.0)
+    assert scene.clean_share == 0.3
+    assert clean_share(scene) == pytest.approx(0.3, abs=0.01)
+    with pytest.raises(UsageError, match=r"severity from 1\.5 on"):
+        _changed(scene, 0.1, 1.0)
 
 
 def test_render_and_preview(

@@ -212,8 +212,16 @@ def test_a_hidden_hand_makes_the_camera_move(
     scene = make_scene()
     (item, *_) = free_views(scene, 6)
     empty = np.zeros((SIZE, SIZE))
-    monkeypatch.setattr(free_view, "render_view", lambda *parts: (empty, empty))
+    seen: list[np.ndarray] = []
+
+    def render_view(scene: Scene, hands: object, view: np.ndarray, *rest: object) -> object:
+        seen.append(view)
+        return empty, empty
+
+    monkeypatch.setattr(free_view, "render_view", render_view)
     moved, _, _ = free_view.render_free(scene, item, SIZE, np.ones(3), free_view.RenderCost())
+    # The camera that is told is the one of the image, though it never saw enough.
+    np.testing.assert_array_equal(moved.view, seen[-1])
     along = [-view.view[2, :3] @ hand_axes(item.hands)[:, 2] for view in (item, moved)]
     assert along[1] > max(along[0], 0.9)
 

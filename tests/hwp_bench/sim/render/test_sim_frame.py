@@ -13,7 +13,9 @@ import pytest
 from tiny_scene import BLUR, CLEAN, LIGHT, OBJECT
 
 from hwp_bench.base.tables import to_markdown
+from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.sim.effects import SUBFRAME_STEP, plan_frame
+from hwp_bench.sim.produce.capture import true_hands
 from hwp_bench.sim.produce.forecast import forecast, plan_table
 from hwp_bench.sim.props.objects import build_object
 from hwp_bench.sim.render.frame import SimulatedFrame, render_frame
@@ -73,6 +75,28 @@ def test_an_effect_changes_its_frames_and_no_other(
         np.testing.assert_array_equal(before.rgb, after.rgb)
         np.testing.assert_array_equal(before.coverage, after.coverage)
         assert before.cost.rays == after.cost.rays
+
+
+def test_the_first_validation_frame_is_clean_though_an_episode_reaches_into_it(
+    make_scene: SceneMaker,
+) -> None:
+    # Oracle: the scene without effects. The first of 12 frames that validates is that at 0.75.
+    scene = make_scene(
+        ('kind = "illumination"\n', 'kind = "complex_poses"\nright = [{ gesture = "claw" }]\n'),
+        ("[[0.3, 0.4, 3]]", "[[0.6, 0.799, 5]]"),
+        ("[[0.5, 0.6, 3]]", "[[0.6, 0.799, 5]]"),
+    )
+    bare = with_effects(scene, ())
+    first = contiguous_split(scene.id, 12).validation[0]
+    plans = [plan_frame(scene, frame, 12, SIZE) for frame in range(12)]
+    assert set(plans[first - 1].strength) == {"complex_poses", "motion_blur"}
+    assert plans[first].severity == {call.kind: 0 for call in scene.effects}
+    shown, expected = (render_frame(each, first, 12, SIZE) for each in (scene, bare))
+    np.testing.assert_array_equal(shown.rgb, expected.rgb)
+    np.testing.assert_array_equal(shown.clean, expected.clean)
+    poses = [true_hands(each, plans)["right"].pose for each in (scene, bare)]
+    assert (poses[0][first - 1] != poses[1][first - 1]).any()
+    np.testing.assert_array_equal(poses[0][first:], poses[1][first:])
 
 
 def test_rays_are_those_of_the_passes(render: Callable[[int], SimulatedFrame]) -> None:
@@ -147,6 +171,11 @@ def test_a_scene_without_objects_builds_none(make_scene: SceneMaker) -> None:
     assert build_object.cache_info().misses == 0
     render_frame(make_scene(), OBJECT, COUNT, SIZE)
     assert build_object.cache_info().misses > 0
+
+
+def test_the_forecast_counts_clean_frames_of_the_training_part(make_scene: SceneMaker) -> None:
+    # Of the 9 training frames of 12, at 0, 1/12, ... 8/12, effects leave 0, 3, 5 and 8.
+    assert forecast(make_scene(), 12, SIZE, probe=False).clean_frames == 4
 
 
 def test_the_forecast_is_the_sum_of_what_is_called_for(make_scene: SceneMaker) -> None:

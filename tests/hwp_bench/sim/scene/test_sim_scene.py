@@ -136,6 +136,16 @@ def test_a_clean_share_that_episodes_cannot_have_is_refused(make_scene: SceneMak
         with_clean_share(with_severity(make_scene(), 1), 0.1)
 
 
+def test_a_changed_scene_states_no_clean_share_that_is_false() -> None:
+    # Oracle: the share as it is measured. Ends of episodes of severity 1 are clean.
+    scene = load_scene("persistent-2")
+    assert with_severity(scene, 3).clean_share == scene.clean_share == 0.1
+    mild = with_severity(scene, 1)
+    assert clean_share(mild) > 0.15
+    assert mild.clean_share is None
+    assert with_effects(scene, ()).clean_share is None
+
+
 def test_a_scene_file_says_its_clean_share(make_scene: SceneMaker) -> None:
     text = ("seed = 5", "seed = 5\nclean_share = 0.2")
     assert make_scene(text) == with_clean_share(make_scene(), 0.2)
@@ -174,6 +184,12 @@ def test_nothing_acts_in_validation_and_test(name: str) -> None:
         ("[[0.3, 0.4, 3]]", "[[0.3, 0.4, 7]]", "effects[1].episodes"),
         ("[[0.3, 0.4, 3]]", "[[0.4, 0.3, 3]]", "effects[1].episodes"),
         ("[[0.3, 0.4, 3]]", "[[0.3, 0.9, 3]]", "effects[1].episodes"),
+        ("[[0.3, 0.4, 3]]", "[[0.7, 0.8, 3]]", "effects[1].episodes"),
+        ("[[0.3, 0.4, 3]]", "[[0.35, 0.4, 3], [0.3, 0.36, 2]]", "effects[1].episodes"),
+        ("age = 31.0", 'age = 31.0\nmodel = "gtlf:hand.glb"', "subject.model"),
+        ("age = 31.0", 'age = 31.0\nmodel = "gltf:"', "subject.model"),
+        ("age = 31.0", 'age = 31.0\nmodel = "rig:nobody"', "subject.model"),
+        ("age = 31.0", "age = 31.0\nsleeve = [-1.0, 0.5, 0.4]", "subject.sleeve[0]"),
         ("[[0.3, 0.4, 3]]", "[[0.21, 0.79, 3]]", "effects"),
         ('object = "block"', 'object = "brick"', "object"),
         ('anchor = "right"', 'anchor = "left"', "anchor"),
@@ -186,6 +202,26 @@ def test_damage_is_named(make_scene: SceneMaker, old: str, new: str, field: str)
         make_scene((old, new))
     assert caught.value.where == "tiny.toml"
     assert field in str(caught.value)
+
+
+def test_a_light_that_does_nothing_is_refused(make_scene: SceneMaker) -> None:
+    # Neither key light nor lamps: of the default modes, move comes third.
+    dark = ("key = 0.6", "key = 0.0")
+    two, three = (
+        ("[[0.3, 0.4, 3]]", f"[[0.3, 0.33, 3], [0.35, 0.37, 3]{more}]")
+        for more in ("", ", [0.38, 0.4, 3]")
+    )
+    make_scene(dark, two)
+    with pytest.raises(BadInput, match=r"effects\(illumination\)\.modes: 'move' changes the key"):
+        make_scene(dark, three)
+    lamp = "[[light.lamps]]\nplace = [1.0, 0.0, 0.0]\nstrength = 1.0\n[track]"
+    make_scene(dark, three, ("[track]", lamp))
+
+
+def test_a_clean_share_just_too_small_is_shown_as_such(make_scene: SceneMaker) -> None:
+    # 700 of the 2,001 moments at which it is measured: 34.98 %, less than 35 %.
+    with pytest.raises(BadInput, match=r"only 34\.98% of the training part"):
+        make_scene(("[[0.3, 0.4, 3]]", "[[0.2502, 0.62, 3]]"))
 
 
 #: Tables with a field at fault: what stands before `[track]`, and the field.
