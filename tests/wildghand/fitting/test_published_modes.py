@@ -6,6 +6,7 @@ frames, torch's own optimizer.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 import torch
 from odd_fits import odd_fit, part
-from painted import TrainingMaker
+from painted import SilentReport, TrainingMaker
 from tiny_fits import TINY
 
 from hwp_bench.capture import HandModelId
@@ -25,8 +26,11 @@ from wildghand.fitting.method import affordable
 from wildghand.fitting.objective import Reconstruction, Regularisers, choose_perceptual
 from wildghand.fitting.start import StartFromPrior
 from wildghand.fitting.weights import Pao
+from wildghand.gaussians.fit_loop import Loss
 from wildghand.gaussians.regularizers import surface_laplacian
+from wildghand.model import terms
 from wildghand.model.settings import read_settings
+from wildghand.plain import loop
 
 ROWS = torch.tensor([0, 3])
 
@@ -207,6 +211,28 @@ def test_adam_is_torchs_with_its_own_constants(mode: str, make_training: Trainin
         if pairs:
             torch.optim.Adam(pairs, lr=group["start"]).step()
     assert max(float((a - b).detach().abs().max()) for a, b in given) < 1e-7
+
+
+def test_a_fit_whose_loss_falls_below_zero_goes_on(
+    make_training: TrainingMaker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Oracle: without the reward the loss is what it was. Windows of four steps; the reward of
+    # weights is raised after the first, so that the second one's mean loss is below 0.
+    monkeypatch.setattr(loop, "WINDOW", 4)
+    fit = fit_of(make_training(), "paper")
+    kept = dict(terms.WEIGHTS)
+    losses: list[float] = []
+
+    def raise_reward(step: int, watchers: loop.Watchers, told: Loss) -> None:
+        losses.append(float(fit.loss(StepBatch(ROWS)).detach()))
+        assert float(told) > 0.0
+        if step == 4:
+            raised = replace(kept["paper"], weight_reward=1e4)
+            monkeypatch.setattr(terms, "WEIGHTS", {**kept, "paper": raised})
+
+    avatar = loop.run_fit(fit, Budget(steps=12), SilentReport(), after_step=raise_reward)
+    assert min(losses[:4]) > 0.0 > max(losses[4:])
+    assert avatar.record.steps == 12
 
 
 @pytest.mark.parametrize(
