@@ -178,6 +178,7 @@ class WildGHandModel(nn.Module):
         teach: Callable[[Tensor], Tensor | None] | None = None,
         move: bool = False,
         refine: bool = False,
+        pose_head: bool = True,
         features: Mapping[str, HandFeatures] | None = None,
         dark: Mapping[str, Tensor] | None = None,
     ) -> RenderedFrames:
@@ -189,6 +190,9 @@ class WildGHandModel(nn.Module):
             kept: (B,) bool by side: False leaves a frame's biases out; None: never.
             teach: from (B,) temporal weights, before dropout and without gradient, to how much the
                 canonical hand learns from each frame, (B,) in [0, 1], or None: all. None: all.
+            move: add the steps of the frames' own poses.
+            refine: apply the network's refinement of the parameters (head iv).
+            pose_head: with it, apply DPD's pose head by time too, where there is one.
             dark: (B, N) factors of the hands' shadows by side, where they are at hand already.
         """
         if dark is None:
@@ -219,7 +223,7 @@ class WildGHandModel(nn.Module):
                 if shares is not None:
                     step = scale_refinement(step, shares)
                 pose, betas, transl = pose + step.pose, betas + step.betas, transl + step.transl
-                if side in self.perturbation:
+                if pose_head and side in self.perturbation:
                     pose, transl = self.biases_of(side).move(pose, transl, temporal[side].z)
             if move or refine:
                 anchors = rig.follow(pose, betas, transl)

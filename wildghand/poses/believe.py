@@ -26,6 +26,8 @@ from wildghand.poses.errors import (
 
 # Largest number that is read, as in a capture, rad or m.
 _LARGEST = 1e6
+# What a correction changes of a hand.
+_POSED = ("pose", "transl")
 _Tables = Annotated[Mapping[str, np.ndarray], Kept(("F", 51), -_LARGEST, _LARGEST)]
 
 
@@ -64,6 +66,15 @@ class ClipPoses(Found):
     def corrected(self, hands: Mapping[str, HandPose]) -> dict[str, HandPose]:
         """The hands; a pose of the clip is replaced by the corrected one."""
         return {side: self._corrected(side, hand) for side, hand in hands.items()}
+
+    def corrected_clip(self, hands: Mapping[str, HandParameters]) -> dict[str, HandParameters]:
+        """The hands of a clip; each pose that is one of this clip is replaced by the corrected."""
+        made = {}
+        for side, hand in hands.items():
+            found = [self._corrected(side, hand.at(row, side)) for row in range(hand.frame_count)]
+            pose, transl = (np.stack([getattr(one, name) for one in found]) for name in _POSED)
+            made[side] = replace(hand, pose=pose, transl=transl)
+        return made
 
     def _corrected(self, side: str, hand: HandPose) -> HandPose:
         numbers = _numbers(hand.pose[None], hand.transl[None])[0]
