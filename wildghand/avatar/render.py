@@ -145,7 +145,7 @@ def explain_frames(
                 info.width,
                 info.height,
                 kept=kept,
-                move=biases,
+                move=torch.tensor([biases]),
                 refine=avatar.settings.heads,
                 pose_head=biases,
             )

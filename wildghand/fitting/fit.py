@@ -71,7 +71,7 @@ class DrawOptions(TypedDict, total=False):
 
     kept: Mapping[str, Tensor]
     teach: Callable[[Tensor], Tensor | None]
-    move: bool
+    move: Tensor
     features: Features
     dark: Mapping[str, Tensor]
 

@@ -69,8 +69,10 @@ class Prepass(Component):
 
     def draws(self, fit: Fit, batch: StepBatch) -> DrawOptions:
         """The pose of frames that disagree with their mask is refined, in a batch with any."""
-        move = fit.settings.prepass.frame_poses and bool(self._refine_pose[batch.rows].any())
-        return {"move": move}
+        moved = self._refine_pose[batch.rows]
+        if not fit.settings.prepass.frame_poses or not bool(moved.any()):
+            return {}
+        return {"move": upload(moved[batch.part], fit.device)}
 
     def compare(
         self, fit: Fit, batch: StepBatch, drawing: RenderedFrames, target: FrameTarget

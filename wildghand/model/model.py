@@ -176,7 +176,7 @@ class WildGHandModel(nn.Module):
         *,
         kept: Mapping[str, Tensor] | None = None,
         teach: Callable[[Tensor], Tensor | None] | None = None,
-        move: bool = False,
+        move: Tensor | None = None,
         refine: bool = False,
         pose_head: bool = True,
         features: Mapping[str, HandFeatures] | None = None,
@@ -190,7 +190,7 @@ class WildGHandModel(nn.Module):
             kept: (B,) bool by side: False leaves a frame's biases out; None: never.
             teach: from (B,) temporal weights, before dropout and without gradient, to how much the
                 canonical hand learns from each frame, (B,) in [0, 1], or None: all. None: all.
-            move: add the steps of the frames' own poses.
+            move: (B,) bool, frames whose pose takes the frame's own step; None: none.
             refine: apply the network's refinement of the parameters (head iv).
             pose_head: with it, apply DPD's pose head by time too, where there is one.
             dark: (B, N) factors of the hands' shadows by side, where they are at hand already.
@@ -211,9 +211,10 @@ class WildGHandModel(nn.Module):
             anchors = clip.hand(side, rows)
             pose, betas, transl = clip.parameters[side]
             pose, transl = pose[rows], transl[rows]
-            if move:
-                pose = pose + self.pose_steps[index, rows]
-                transl = transl + self.transl_steps[index, rows]
+            if move is not None:
+                moved = move.to(pose)[:, None]
+                pose = pose + moved[..., None] * self.pose_steps[index, rows]
+                transl = transl + moved * self.transl_steps[index, rows]
             prediction = self.predict(
                 side, anchors, pose.detach(), None if features is None else features[side]
             )
@@ -225,7 +226,7 @@ class WildGHandModel(nn.Module):
                 pose, betas, transl = pose + step.pose, betas + step.betas, transl + step.transl
                 if pose_head and side in self.perturbation:
                     pose, transl = self.biases_of(side).move(pose, transl, temporal[side].z)
-            if move or refine:
+            if move is not None or refine:
                 anchors = rig.follow(pose, betas, transl)
             perturbation, omega = None, pose.new_zeros(len(rows))
             if side in self.perturbation:

@@ -68,7 +68,7 @@ class ClipPoses(Found):
         return {side: self._corrected(side, hand) for side, hand in hands.items()}
 
     def corrected_clip(self, hands: Mapping[str, HandParameters]) -> dict[str, HandParameters]:
-        """The hands of a clip; each pose that is one of this clip is replaced by the corrected."""
+        """The hands of a clip; poses of this one are replaced by the corrected ones."""
         made = {}
         for side, hand in hands.items():
             found = [self._corrected(side, hand.at(row, side)) for row in range(hand.frame_count)]
