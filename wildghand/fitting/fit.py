@@ -383,8 +383,6 @@ class Fit(IterativeFit[WildGHandAvatar]):
         data = self.data
         fields: dict[str, Any] = {
             "frames": data.frames.indices.tolist(),
-            "clean": data.judgement.clean.tolist(),
-            "frame_weights": data.judgement.frame_weights.tolist(),
             "source": {"capture": data.training.id},
         }
         for component in self.components:

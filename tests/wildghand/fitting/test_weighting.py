@@ -205,6 +205,17 @@ def test_only_poses_that_disagree_with_their_mask_are_refined_in_a_batch_of_both
         assert moved.nonzero().flatten().tolist() == [3]
 
 
+@pytest.mark.parametrize("judged", [True, False])
+def test_an_avatar_says_which_frames_are_clean_where_they_were_judged(
+    judged: bool, make_training: TrainingMaker
+) -> None:
+    fit = fit_of(make_training(), **{"prepass.enabled": judged})
+    record = fit.avatar(0).record
+    found = fit.data.judgement
+    assert record.clean == (found.clean.tolist() if judged else [])
+    assert record.frame_weights == (found.frame_weights.tolist() if judged else [])
+
+
 def test_without_heads_the_template_stands_and_nothing_else_changes(
     make_training: TrainingMaker,
 ) -> None:
