@@ -96,7 +96,9 @@ def _fit_in(
         write_request(work / f"request-{index}", capture, every_frame(capture), run)
         for index, capture in enumerate(captures)
     ]
-    digest = sha256_json([*map(digest_of_request, requests, captures)])
+    digest = sha256_json(
+        [digest_of_request(*each, chosen) for each in zip(requests, captures, strict=True)]
+    )
     trainings = [open_request(request) for request in requests]
     joint = JointFit(trainings, chosen, run.seed, ready_fit(chosen.device))
     title = f"Pretraining on {len(captures)} captures"
