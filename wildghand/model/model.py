@@ -230,10 +230,10 @@ class WildGHandModel(nn.Module):
                 anchors = rig.follow(pose, betas, transl)
             perturbation, omega = None, pose.new_zeros(len(rows))
             if side in self.perturbation:
-                omega = temporal[side].omega
                 perturbation = self.perturbation_in(
                     side, temporal[side], anchors, None if kept is None else kept[side]
                 )
+                omega = perturbation.omega
             gaussians, bias_size = dress(
                 anchors, prediction, self.network.activation, perturbation, shares
             )

@@ -6,6 +6,7 @@ frames, torch's own optimizer.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -21,6 +22,7 @@ from tiny_fits import TINY
 from hwp_bench.capture import HandModelId
 from hwp_bench.hands import pose_hand, project
 from hwp_bench.methods.contract import Budget, TrainingCapture
+from wildghand.fitting.disentangle import Dpd
 from wildghand.fitting.fit import Component, Fit, StepBatch
 from wildghand.fitting.method import affordable
 from wildghand.fitting.objective import Reconstruction, Regularisers, choose_perceptual
@@ -29,6 +31,7 @@ from wildghand.fitting.weights import Pao
 from wildghand.gaussians.fit_loop import Loss
 from wildghand.gaussians.regularizers import surface_laplacian
 from wildghand.model import terms
+from wildghand.model.frames import HandState
 from wildghand.model.settings import read_settings
 from wildghand.plain import loop
 
@@ -123,6 +126,32 @@ def test_the_loss_is_the_sum_of_its_terms(mode: str, make_training: TrainingMake
             # No term could be left out unseen.
             assert min(map(abs, sums.values())) > 1e-4 * abs(found), sums
     assert total == pytest.approx(sum(sum(s.values()) for s in expected.values()), rel=1e-5)
+
+
+def test_in_paper_a_frame_whose_omega_is_dropped_has_no_temporal_factor(
+    make_training: TrainingMaker,
+) -> None:
+    # Oracle: lambda_u of omega = 0 in the frame that is dropped, 1 / (1 + beta |omega|) of it else.
+    # Thresholds of the background are below every error, so that W has lambda_u alone.
+    fit = fit_of(make_training(), "paper")
+    part(fit, Pao).weights.T_b.data.fill_(-1.0)
+    part(fit, Dpd).drop = (torch.arange(len(fit.data.frames)) == 3).float()
+    batch = StepBatch(ROWS)
+    omega = fit.model.biases[0].temporal(ROWS).omega.detach()
+    assert omega.abs().min() > 1e-4
+    drawing = fit.draw(batch)
+    kept = fit.draw(replace(batch, stepping=True))
+    for drawn, left in ((drawing, [True, True]), (kept, [True, False])):
+        expected = omega * torch.tensor(left)
+        torch.testing.assert_close(drawn.omega.detach(), expected, rtol=0, atol=0)
+        found = fit.compare(batch, replace(drawing, hands=drawn.hands)).weights
+        factor = 1.0 / (1.0 + 1000.0 * expected.abs())
+        plain = fit.compare(batch, replace(drawing, hands=_without_omega(drawn.hands))).weights
+        torch.testing.assert_close(found, plain * factor[:, None, None], rtol=1e-5, atol=1e-6)
+
+
+def _without_omega(hands: Mapping[str, HandState]) -> dict[str, HandState]:
+    return {side: replace(hand, omega=0.0 * hand.omega) for side, hand in hands.items()}
 
 
 @pytest.mark.parametrize("mode", ["paper", "released"])
