@@ -170,7 +170,7 @@ def known_oracle_inputs(capture: Capture) -> tuple[str, ...]:
 def choose_training_inputs(capture: Capture, split: Split, choice: str) -> TrainingInputs:
     """Return the training part that a method is given of a capture."""
     if choice.startswith(_PREFIX):
-        return _with_truths(capture, split, _replaced_by(choice))
+        return _with_truths(capture, split, choice)
     if choice not in FRAME_CHOICES:
         raise UsageError(f"{choice!r} is not one of {', '.join(FRAME_CHOICES)}", field="frames")
     hands = dict(capture.hands)
@@ -193,6 +193,16 @@ def choose_training_inputs(capture: Capture, split: Split, choice: str) -> Train
     return TrainingInputs(split.train, "clean", "clean_masks", repaired)
 
 
+def frames_of_true_poses(split: Split, choice: str) -> np.ndarray:
+    """(F,) bool: in which frames a choice of frames replaces poses by the truth, whatever acts."""
+    names, rows = _replaced_by(choice), np.zeros(split.frame_count, dtype=bool)
+    if "poses" in names:
+        rows[split.train] = True
+    if "test-poses" in names:
+        rows[split.validation] = rows[split.test] = True
+    return rows
+
+
 def choose_free_view_hands(clip: Capture, choice: str) -> dict[str, HandParameters]:
     """Return the hand parameters of a free-view clip that a method is given."""
     truth = clip.true_hands
@@ -206,8 +216,9 @@ def _replaced_by(choice: str) -> list[str]:
     return choice.removeprefix(_PREFIX).split(",") if choice.startswith(_PREFIX) else []
 
 
-def _with_truths(capture: Capture, split: Split, names: list[str]) -> TrainingInputs:
+def _with_truths(capture: Capture, split: Split, choice: str) -> TrainingInputs:
     """The capture with some estimates replaced by the truth."""
+    names = _replaced_by(choice)
     known = known_oracle_inputs(capture)
     for name in names:
         if name not in ORACLE_INPUTS:
@@ -221,11 +232,7 @@ def _with_truths(capture: Capture, split: Split, names: list[str]) -> TrainingIn
     frames, masks = ("clean", "clean_masks") if "pixels" in names else ("frames", "masks")
     if "masks" in names and "pixels" not in names:
         masks = "true_masks"
-    rows = np.zeros(len(capture), dtype=bool)
-    if "poses" in names:
-        rows[split.train] = True
-    if "test-poses" in names:
-        rows[split.validation] = rows[split.test] = True
+    rows = frames_of_true_poses(split, choice)
     hands = dict(capture.hands)
     for side, truth in (capture.true_hands or {}).items():
         hands[side] = _replaced(hands[side], truth, rows)

@@ -126,7 +126,7 @@ class FitRecord:
     temporal: dict[str, Annotated[list[_Omega], _PER_FRAME]] = field(default_factory=dict)
     #: Probability that each is clean, as the pre-pass judged; empty without it.
     clean: Annotated[list[_Share], _PER_FRAME] = field(default_factory=list)
-    #: Weight of each in the fit.
+    #: Weight of each, as it judged; empty without it.
     frame_weights: Annotated[list[_Weight], _PER_FRAME] = field(default_factory=list)
     #: Optimizer steps.
     steps: Count = 0

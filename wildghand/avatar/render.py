@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import time
 from collections.abc import Mapping, Sequence
@@ -133,7 +134,11 @@ def explain_frames(
     for frame in frames:
         if frame not in fitted:
             raise UsageError(f"{frame} was not fitted", field="frames")
-    clip = TrainingClip(capture, np.array(fitted), model.rigs, torch.device("cpu"))
+    posed = capture
+    if model.clip_poses is not None:
+        # What the frames were explained in.
+        posed = dataclasses.replace(capture, hands=model.clip_poses.corrected_clip(capture.hands))
+    clip = TrainingClip(posed, np.array(fitted), model.rigs, torch.device("cpu"))
     info, found = capture.info, []
     for frame in frames:
         row = fitted.index(frame)
@@ -146,8 +151,9 @@ def explain_frames(
                 info.width,
                 info.height,
                 kept=kept,
-                move=True,
+                move=torch.tensor([biases]),
                 refine=avatar.settings.heads,
+                pose_head=biases,
             )
             image = drawing.image[0] if biases else drawing.image[0] / model.log_gains[row].exp()
             pictures.append(image.clamp(0.0, 1.0).numpy())

@@ -296,12 +296,17 @@ class FramePerturbation:
     #: (B, N, 14) field of the module's at the Gaussians; None: no field.
     field: Tensor | None = None
 
+    @property
+    def omega(self) -> Tensor:
+        """(B,) temporal weights; 0 in frames that have no biases."""
+        omega = self.temporal.omega
+        if self.kept is None:
+            return omega
+        return torch.where(self.kept.to(omega.device), omega, omega.new_zeros(()))
+
     def biases(self, raw: RawAttributes) -> RawAttributes:
         """(B, N, k) Delta g; 0 in frames that have none."""
-        omega = self.temporal.omega
-        if self.kept is not None:
-            omega = torch.where(self.kept.to(omega.device), omega, omega.new_zeros(()))
-        return self.module.biases(raw, self.temporal.z, omega, self.field)
+        return self.module.biases(raw, self.temporal.z, self.omega, self.field)
 
 
 def encode_frames(frames: Tensor, frame_count: int) -> Tensor:

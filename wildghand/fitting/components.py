@@ -27,7 +27,6 @@ def components_of(settings: WildGHandSettings) -> list[Component]:
     """
     pao, visibility = settings.pao, settings.visibility
     chosen = settings.schedule.validated or visibility.enabled
-    by_regions = pao.enabled and pao.variant != "binary"
     listed: list[tuple[bool, type[Component]]] = [
         (settings.poses.enabled, Poses),
         (settings.subject.enabled, Person),
@@ -41,7 +40,7 @@ def components_of(settings: WildGHandSettings) -> list[Component]:
         (settings.start_colors, StartColors),
         (settings.terms.leave_hidden, HiddenSkin),
         (True, Reconstruction),
-        (True, Pao if by_regions else MaskWeights),
+        (True, Pao if pao.by_regions else MaskWeights),
         (True, Regularisers),
         (settings.dpd.enabled, Dpd),
         (visibility.enabled, FewShown),

@@ -62,8 +62,8 @@ class FrameTarget:
     hand: Tensor
     #: (B, H, W) weight of each pixel within its frame; a gradient may go through it.
     weights: Tensor
-    #: (B,) means of PAO's weights, which the loss rewards; None without regions.
-    sizes: Tensor | None = None
+    #: What the loss is lowered by because PAO weighs much, a scalar not above 0; None: nothing.
+    reward: Tensor | None = None
 
 
 class DrawOptions(TypedDict, total=False):
@@ -71,7 +71,7 @@ class DrawOptions(TypedDict, total=False):
 
     kept: Mapping[str, Tensor]
     teach: Callable[[Tensor], Tensor | None]
-    move: bool
+    move: Tensor
     features: Features
     dark: Mapping[str, Tensor]
 
@@ -240,15 +240,18 @@ class Fit(IterativeFit[WildGHandAvatar]):
             fraction: share of the budget that is used up.
 
         Returns:
-            The loss, the same in every process; nothing is changed where it is not finite.
+            The loss without the reward of weights, which may bring it below 0; the same in every
+            process. Nothing is changed where it is not finite.
 
         Raises:
             UsageError: the processes cannot share the batch evenly.
             PeerLost: another process has ended.
         """
         self.descent.set_rates(fraction)
-        loss = self.loss(StepBatch(batch, self.world.shard(len(batch)), stepping=True))
-        mean = self.world.average_(loss.detach() + self.descent.shared.value)
+        mine = StepBatch(batch, self.world.shard(len(batch)), stepping=True)
+        loss, reward = self._loss_and_reward(mine)
+        told = loss.detach() + self.descent.shared.value
+        mean = self.world.average_(told if reward is None else told - reward.detach())
         known: Loss = float(mean) if self.device.type == "cpu" else mean
         if isinstance(known, float) and not math.isfinite(known):
             return known
@@ -257,13 +260,16 @@ class Fit(IterativeFit[WildGHandAvatar]):
 
     def loss(self, batch: StepBatch) -> Tensor:
         """The loss of this process's part of a batch, without the terms that no frame enters."""
+        return self._loss_and_reward(batch)[0]
+
+    def _loss_and_reward(self, batch: StepBatch) -> tuple[Tensor, Tensor | None]:
         drawing = self.draw(batch)
         target = self.compare(batch, drawing)
         terms = (t for c in self.components for t in c.loss(self, batch, drawing, target))
         total = next(terms)
         for term in terms:
             total = total + term
-        return total
+        return total, target.reward
 
     def draw(self, batch: StepBatch, **options: Any) -> RenderedFrames:
         """Draw training frames with everything that is particular to them."""
@@ -377,8 +383,6 @@ class Fit(IterativeFit[WildGHandAvatar]):
         data = self.data
         fields: dict[str, Any] = {
             "frames": data.frames.indices.tolist(),
-            "clean": data.judgement.clean.tolist(),
-            "frame_weights": data.judgement.frame_weights.tolist(),
             "source": {"capture": data.training.id},
         }
         for component in self.components:

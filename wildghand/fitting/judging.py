@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -69,8 +70,10 @@ class Prepass(Component):
 
     def draws(self, fit: Fit, batch: StepBatch) -> DrawOptions:
         """The pose of frames that disagree with their mask is refined, in a batch with any."""
-        move = fit.settings.prepass.frame_poses and bool(self._refine_pose[batch.rows].any())
-        return {"move": move}
+        moved = self._refine_pose[batch.rows]
+        if not fit.settings.prepass.frame_poses or not bool(moved.any()):
+            return {}
+        return {"move": upload(moved[batch.part], fit.device)}
 
     def compare(
         self, fit: Fit, batch: StepBatch, drawing: RenderedFrames, target: FrameTarget
@@ -78,6 +81,14 @@ class Prepass(Component):
         """Pixels that are covered count less, with PAO and without."""
         uncovered = fit.data.uncovered(batch.mine)
         return target if uncovered is None else replace(target, weights=target.weights * uncovered)
+
+    def record(self, fit: Fit, *, final: bool) -> dict[str, Any]:
+        """The judgements of the frames."""
+        judged = fit.data.judgement
+        return {
+            "clean": judged.clean.tolist(),
+            "frame_weights": judged.frame_weights.tolist(),
+        }
 
 
 class HandMasks(Component):

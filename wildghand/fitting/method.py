@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
 from hwp_bench.hands.raster import draw_faces, mix_corners
+from hwp_bench.methods.contents import exposed_digest
 from hwp_bench.methods.contract import Budget, Report, TrainingCapture
 from hwp_bench.methods.settings import source_path
 from wildghand.avatar.avatar import WildGHandAvatar
@@ -25,6 +27,7 @@ from wildghand.model.settings import WildGHandSettings, read_settings
 from wildghand.network import NetworkOutput, Refinement
 from wildghand.pao.sam import check_checkpoint
 from wildghand.plain.loop import run_fit
+from wildghand.prior.prior import SHIPPED, find_prior
 from wildghand.splat.threads import denormals_flushed
 
 # Training frames that a budget has room for at least: fewer say too little of a person.
@@ -80,6 +83,15 @@ def affordable(
     if budget.seconds is None or not share:
         return training
     return training.thinned(max(_LEAST, int(share * budget.seconds)))
+
+
+def digest_of_named_files(settings: WildGHandSettings) -> str:
+    """SHA-256 (hex) of the content of the files that settings name: the prior, and networks."""
+    sources = (settings.pao.regions, settings.pao.hand, settings.perceptual)
+    paths = [Path(path) for path in map(source_path, sources) if path is not None]
+    if settings.prior not in ("", SHIPPED):
+        paths.append(find_prior(settings.prior))
+    return exposed_digest(paths)
 
 
 def check_networks(values: Mapping[str, Any]) -> None:

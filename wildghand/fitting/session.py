@@ -36,10 +36,10 @@ from wildghand.avatar.files import (
 )
 from wildghand.fitting.components import make_fit
 from wildghand.fitting.fit import Fit
-from wildghand.fitting.method import affordable, ready_fit
+from wildghand.fitting.method import affordable, digest_of_named_files, ready_fit
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
 from wildghand.gaussians.fit_loop import Loss
-from wildghand.model.settings import read_settings
+from wildghand.model.settings import WildGHandSettings, read_settings
 from wildghand.plain.loop import IterativeFit, Watchers, run_fit
 from wildghand.splat.threads import denormals_flushed
 
@@ -139,7 +139,8 @@ def fit_capture(
             return avatar
     out, work = Path(out), unfinished(Path(out))
     limits = [run.budget.seconds, run.budget.steps]
-    call = sha256_json([capture.digest, split.digest, dict(run.settings), seed, limits])
+    named = digest_of_named_files(chosen)
+    call = sha256_json([capture.digest, split.digest, dict(run.settings), named, seed, limits])
     if kept:
         if not made_by_call(out, call):
             raise exists
@@ -172,7 +173,7 @@ def _fit_in(
     world.wait_for_main()
     chosen = read_settings(run.settings)
     training = affordable(open_request(work / "request"), chosen, run.budget)
-    digest = digest_of_request(work / "request", capture)
+    digest = digest_of_request(work / "request", capture, chosen)
     entered = time.perf_counter()
     device = ready_fit(chosen.device)
     if world.is_main:
@@ -197,9 +198,10 @@ def _fit_in(
     )
 
 
-def digest_of_request(request: Path, capture: Capture) -> str:
-    """Digest of the request and of the capture's files, which a saved state belongs to."""
-    return sha256_json([sha256_file(request / REQUEST), capture.info.to_json().get("digests")])
+def digest_of_request(request: Path, capture: Capture, settings: WildGHandSettings) -> str:
+    """Digest of what a saved state belongs to: request, the capture's files and named ones."""
+    files = capture.info.to_json().get("digests")
+    return sha256_json([sha256_file(request / REQUEST), files, digest_of_named_files(settings)])
 
 
 def run_resumed(
@@ -300,7 +302,7 @@ def load_state(
 def _check_digest(state: Mapping[str, Any], digest: str, file: Path) -> None:
     if state.get("digest") != digest:
         raise BadInput(
-            "belongs to another capture, other settings or another seed",
+            "belongs to another capture, other settings or files that they name, or another seed",
             where=file,
             remedy="Give the same arguments to continue with it, or remove it to start again.",
         )

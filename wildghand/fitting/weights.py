@@ -128,13 +128,13 @@ class Pao(Component):
             self.median = running_median(self.median, found.mean_errors, found.shares > 0.0)
             self.places.watch(rows, error, hands > 0.5, self.median)
         weights, lifts = found.weights[batch.part], self.lifts[mine]
-        sizes = weights.mean(dim=(1, 2))
+        reward = _reward(fit, weights)
         if bool((lifts > 0.0).any()):
             share = upload(lifts, fit.device)[:, None, None].to(weights)
             weights = torch.lerp(weights, target.hand.to(weights), share)
         if self._scaled:
             weights = weights + fit.settings.terms.outside_weight * (1.0 - target.hand)
-        return replace(target, weights=weights * target.weights, sizes=sizes)
+        return replace(target, weights=weights * target.weights, reward=reward)
 
     def _compare_as_released(
         self, fit: Fit, batch: StepBatch, drawing: RenderedFrames, target: FrameTarget
@@ -151,16 +151,15 @@ class Pao(Component):
         weights = found.weights
         image = whole * visible[..., None]
         return replace(
-            target, image=image, weights=weights * target.weights, sizes=weights.mean(dim=(1, 2))
+            target, image=image, weights=weights * target.weights, reward=_reward(fit, weights)
         )
 
     def loss(
         self, fit: Fit, batch: StepBatch, drawing: RenderedFrames, target: FrameTarget
     ) -> Iterable[Tensor]:
         """Keep it from weighing everything with 0."""
-        weight = fit.settings.terms.fixed.weight_reward
-        if weight and target.sizes is not None:
-            yield weight * terms.weight_reward(target.sizes)
+        if target.reward is not None:
+            yield target.reward
 
     def state_dict(self) -> dict[str, Any]:
         """See `Component`."""
@@ -182,6 +181,12 @@ def choose_segmenter(source: str, device: torch.device) -> Segmenter:
     """What cuts frames into regions, as the setting `pao.regions` says."""
     path = source_path(source)
     return Superpixels() if path is None else open_sam(path, str(device))
+
+
+def _reward(fit: Fit, weights: Tensor) -> Tensor | None:
+    """The weighted reward of W (B, H, W), a scalar; None where it has no weight."""
+    weight = fit.settings.terms.fixed.weight_reward
+    return weight * terms.weight_reward(weights.mean(dim=(1, 2))) if weight else None
 
 
 def _mean_error(drawing: Tensor, image: Tensor) -> Tensor:

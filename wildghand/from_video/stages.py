@@ -31,6 +31,7 @@ from hwp_bench.tracking.track_video import NoHandSeen, landmark_sheet
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import CALL, DESCRIPTION, MODEL, WEIGHTS, load_avatar
 from wildghand.avatar.studio import REST, Pose
+from wildghand.fitting.method import digest_of_named_files
 from wildghand.fitting.session import fit_capture, unfinished
 from wildghand.from_video.run import Stage, VideoJob, stride
 from wildghand.from_video.verdict import judge_avatar, read_verdict
@@ -285,6 +286,9 @@ class FitStage(Stage):
         return {
             "capture": open_capture(job.capture).digest,
             "settings": canonical_json(options.method_settings()),
+            "files that settings name": digest_of_named_files(
+                read_settings(options.method_settings())
+            ),
             "steps": str(options.steps),
             "seconds": str(options.seconds),
             "seed": str(options.seed),

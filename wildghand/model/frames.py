@@ -27,7 +27,8 @@ class HandState:
     #: Mean over Gaussians and frames of the sum of |bias| over the channels, a scalar; None while
     #: perturbations are not modelled.
     bias_size: Tensor | None
-    #: (B,) temporal weight before dropout; zeros while perturbations are not modelled.
+    #: (B,) temporal weight of the paper's lambda_u: 0 in frames whose biases are left out; zeros
+    #: while perturbations are not modelled.
     omega: Tensor
     #: (B, N) opacities that were drawn.
     opacities: Tensor

@@ -176,8 +176,9 @@ class WildGHandModel(nn.Module):
         *,
         kept: Mapping[str, Tensor] | None = None,
         teach: Callable[[Tensor], Tensor | None] | None = None,
-        move: bool = False,
+        move: Tensor | None = None,
         refine: bool = False,
+        pose_head: bool = True,
         features: Mapping[str, HandFeatures] | None = None,
         dark: Mapping[str, Tensor] | None = None,
     ) -> RenderedFrames:
@@ -189,6 +190,9 @@ class WildGHandModel(nn.Module):
             kept: (B,) bool by side: False leaves a frame's biases out; None: never.
             teach: from (B,) temporal weights, before dropout and without gradient, to how much the
                 canonical hand learns from each frame, (B,) in [0, 1], or None: all. None: all.
+            move: (B,) bool, frames whose pose takes the frame's own step; None: none.
+            refine: apply the network's refinement of the parameters (head iv).
+            pose_head: with it, apply DPD's pose head by time too, where there is one.
             dark: (B, N) factors of the hands' shadows by side, where they are at hand already.
         """
         if dark is None:
@@ -207,9 +211,10 @@ class WildGHandModel(nn.Module):
             anchors = clip.hand(side, rows)
             pose, betas, transl = clip.parameters[side]
             pose, transl = pose[rows], transl[rows]
-            if move:
-                pose = pose + self.pose_steps[index, rows]
-                transl = transl + self.transl_steps[index, rows]
+            if move is not None:
+                moved = move.to(pose)[:, None]
+                pose = pose + moved[..., None] * self.pose_steps[index, rows]
+                transl = transl + moved * self.transl_steps[index, rows]
             prediction = self.predict(
                 side, anchors, pose.detach(), None if features is None else features[side]
             )
@@ -219,16 +224,16 @@ class WildGHandModel(nn.Module):
                 if shares is not None:
                     step = scale_refinement(step, shares)
                 pose, betas, transl = pose + step.pose, betas + step.betas, transl + step.transl
-                if side in self.perturbation:
+                if pose_head and side in self.perturbation:
                     pose, transl = self.biases_of(side).move(pose, transl, temporal[side].z)
-            if move or refine:
+            if move is not None or refine:
                 anchors = rig.follow(pose, betas, transl)
             perturbation, omega = None, pose.new_zeros(len(rows))
             if side in self.perturbation:
-                omega = temporal[side].omega
                 perturbation = self.perturbation_in(
                     side, temporal[side], anchors, None if kept is None else kept[side]
                 )
+                omega = perturbation.omega
             gaussians, bias_size = dress(
                 anchors, prediction, self.network.activation, perturbation, shares
             )

@@ -1,7 +1,8 @@
 """Settings of WildGHand: what is fitted, how, and for how long.
 
 One table for each component. `read_settings` makes the settings of a mode with some of them
-changed. What it returns says plainly what runs: no setting overrules another one.
+changed. What it returns says plainly what runs: of its settings only `schedule.epochs` overrules
+another one.
 """
 
 from __future__ import annotations
@@ -65,7 +66,8 @@ class ScheduleSettings:
 
     #: Optimizer steps unless epochs or the budget say otherwise.
     steps: int = number(2_000, 1, 10_000_000)
-    #: How often a fit looks at every frame, unless the budget says otherwise; 0: `steps` counts.
+    #: How often a fit looks at every frame, whatever `steps` is, unless the budget says otherwise;
+    #: 0: `steps` counts.
     epochs: int = number(0, 0, 1_000_000)
     #: Frames in each step; 0: one for each hand, in every process.
     batch: int = number(1, 0, 64)
@@ -270,11 +272,11 @@ def _without_idle_parts(settings: WildGHandSettings) -> WildGHandSettings:
         dpd=dataclasses.replace(
             dpd,
             additions=dpd.enabled and dpd.additions,
-            poses=dpd.enabled and dpd.poses,
+            poses=dpd.enabled and dpd.poses and settings.heads,
         ),
         pao=dataclasses.replace(
             pao,
-            regions=pao.regions if pao.enabled else "superpixels",
+            regions=pao.regions if pao.by_regions else "superpixels",
             hand=pao.hand if pao.enabled else "estimated",
         ),
         prepass=dataclasses.replace(prepass, frame_poses=prepass.enabled and prepass.frame_poses),

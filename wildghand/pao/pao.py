@@ -183,6 +183,11 @@ class PaoSettings:
     #: as the pre-pass judges, in `scaled`: a large error there is a fault of the fit.
     spare_clean: ClassVar[bool] = True
 
+    @property
+    def by_regions(self) -> bool:
+        """Whether frames are cut into regions."""
+        return self.enabled and self.variant != "binary"
+
     def __post_init__(self) -> None:
         check_source(self.regions, "regions", ("superpixels",), ("sam",))
         check_source(self.hand, "hand", ("estimated", "graph-cut"), ("sam",))

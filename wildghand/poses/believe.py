@@ -26,6 +26,8 @@ from wildghand.poses.errors import (
 
 # Largest number that is read, as in a capture, rad or m.
 _LARGEST = 1e6
+# What a correction changes of a hand.
+_POSED = ("pose", "transl")
 _Tables = Annotated[Mapping[str, np.ndarray], Kept(("F", 51), -_LARGEST, _LARGEST)]
 
 
@@ -65,6 +67,15 @@ class ClipPoses(Found):
         """The hands; a pose of the clip is replaced by the corrected one."""
         return {side: self._corrected(side, hand) for side, hand in hands.items()}
 
+    def corrected_clip(self, hands: Mapping[str, HandParameters]) -> dict[str, HandParameters]:
+        """The hands of a clip; poses of this one are replaced by the corrected ones."""
+        made = {}
+        for side, hand in hands.items():
+            found = [self._corrected(side, hand.at(row, side)) for row in range(hand.frame_count)]
+            pose, transl = (np.stack([getattr(one, name) for one in found]) for name in _POSED)
+            made[side] = replace(hand, pose=pose, transl=transl)
+        return made
+
     def _corrected(self, side: str, hand: HandPose) -> HandPose:
         numbers = _numbers(hand.pose[None], hand.transl[None])[0]
         row = self._rows.get(side, {}).get(numbers.tobytes())
@@ -97,20 +108,31 @@ def believed_hands(
     templates: Mapping[str, HandTemplate],
     hands: Mapping[str, HandParameters],
     cameras: Cameras,
+    exact: np.ndarray | None = None,
 ) -> dict[str, HandParameters]:
     """Correct the given poses of a clip by what they have in common.
 
     A hand moves in few ways, and an estimator errs in all. How the clip's poses spread and how much
     they err is found from the given poses of all frames; no picture is read.
+
+    Args:
+        exact: (F,) bool, frames whose poses are true: they stay, and say how true poses spread.
+            None: none.
     """
+    if exact is None:
+        exact = np.zeros(len(cameras.viewmats), dtype=bool)
     return {
-        side: _believed(templates[side], hand, cameras.viewmats) for side, hand in hands.items()
+        side: _believed(templates[side], hand, cameras.viewmats, exact)
+        for side, hand in hands.items()
     }
 
 
-def _believed(template: HandTemplate, hand: HandParameters, viewmats: np.ndarray) -> HandParameters:
+def _believed(
+    template: HandTemplate, hand: HandParameters, viewmats: np.ndarray, exact: np.ndarray
+) -> HandParameters:
     valid = np.flatnonzero(hand.valid & in_front(template, hand, viewmats))
-    some = valid[evenly(len(valid), FRAMES)]
+    true, erring = valid[exact[valid]], valid[~exact[valid]]
+    some = erring[evenly(len(erring), FRAMES)]
     if len(some) <= _FINGERS.stop - _FINGERS.start:
         return hand
     extent = extent_in(template, _rows(hand, valid), viewmats[valid])
@@ -123,10 +145,14 @@ def _believed(template: HandTemplate, hand: HandParameters, viewmats: np.ndarray
     mean_square = np.trace(errors, axis1=1, axis2=2).mean() / errors.shape[1]
     if size * np.sqrt(mean_square) < LEAST_ERROR:
         return hand
+    if len(true):
+        known = _shortest(_rows(hand, true[evenly(len(true), FRAMES)])).reshape(-1, 45)
+        poses = np.concatenate([poses, known])
+        errors = np.concatenate([errors, np.zeros((len(known), 45, 45))])
     spread = spread_of(poses, size**2 * errors, _ROUNDS)
     pose, transl = hand.pose.copy(), hand.transl.copy()
-    for start in range(0, len(valid), _CHUNK):
-        rows = valid[start : start + _CHUNK]
+    for start in range(0, len(erring), _CHUNK):
+        rows = erring[start : start + _CHUNK]
         given = _rows(hand, rows)
         together = size**2 * covariances(rows)
         poses, errors = _in_vectors(given, together)

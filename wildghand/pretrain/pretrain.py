@@ -18,6 +18,7 @@ from torch import Tensor
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import sha256_json
 from hwp_bench.base.folders import exclusive
+from hwp_bench.base.records import flattened
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.methods.contract import Avatar, Budget, RunSettings, TrainingCapture
 from hwp_bench.methods.request import open_request, write_request
@@ -40,8 +41,10 @@ from wildghand.splat.threads import denormals_flushed
 
 # Children of a network that belong to its subject.
 _OWN = ("identity", "charts")
-# Thousands of steps end with low rates, as those of the shipped prior did.
-_RATES = {"schedule.decay": "geometric", "schedule.average_share": 0.0}
+# Between two steps on a capture others move the texture branch, which they share. The last steps
+# are thousands, at low rates: nothing is gained by their mean. All frames are fitted, so that none
+# is there to choose a state.
+_SCHEDULE: Mapping[str, Any] = {"texture_every": 1, "average_share": 0.0, "validated": False}
 
 
 @denormals_flushed()
@@ -60,18 +63,30 @@ def pretrain(
     the result is that of a run that was never stopped.
 
     Args:
-        steps: optimizer steps over all captures; None: the settings' number for each capture.
+        steps: optimizer steps over all captures; None: those of a fit for each capture.
+
+    Raises:
+        UsageError: there are too few captures, of several hand models, or a setting is one that
+            pretraining decides.
     """
     refuse_no_prior(out)
     if out.exists() and not overwrite:
         raise UsageError("exists", where=out, remedy="Choose another name, or give --overwrite.")
+    fixed = {f"schedule.{name}": value for name, value in _SCHEDULE.items()}
+    for name, value in flattened(settings):
+        if name in fixed and value != fixed[name]:
+            raise UsageError(
+                f"is {value}, and pretraining has {fixed[name]}", field=name, remedy="Leave it out."
+            )
     # A new prior starts from neither the one that ships nor one person's colours, and knows light
     # by itself, unless asked to.
     settings = {
         "prior": "",
         "start_colors": False,
         "shadows.enabled": False,
-        **_RATES,
+        # Thousands of steps end with low rates, as those of the shipped prior did.
+        "schedule.decay": "geometric",
+        **fixed,
         **settings,
     }
     captures = [open_capture(source) for source in sources]
@@ -103,7 +118,9 @@ def _fit_in(
         write_request(work / f"request-{index}", capture, every_frame(capture), run)
         for index, capture in enumerate(captures)
     ]
-    digest = sha256_json([*map(digest_of_request, requests, captures)])
+    digest = sha256_json(
+        [digest_of_request(*each, chosen) for each in zip(requests, captures, strict=True)]
+    )
     trainings = [open_request(request) for request in requests]
     joint = JointFit(trainings, chosen, run.seed, ready_fit(chosen.device))
     title = f"Pretraining on {len(captures)} captures"
@@ -163,14 +180,8 @@ class JointFit(IterativeFit[tuple[dict[str, Tensor], int]]):
         seed: int,
         device: torch.device,
     ) -> None:
-        # Between two steps on a capture others move the texture branch, which they share. Its last
-        # steps are thousands, at low rates: nothing is gained by their mean. All of its frames are
-        # fitted, so that none is there to choose a state.
-        schedule = dataclasses.replace(
-            settings.schedule, texture_every=1, average_share=0.0, validated=False
-        )
+        schedule = dataclasses.replace(settings.schedule, **_SCHEDULE)
         settings = dataclasses.replace(settings, schedule=schedule)
-        self.settings = settings
         self.device = device
         self.fits: list[Fit] = []
         for training in trainings:
@@ -182,8 +193,9 @@ class JointFit(IterativeFit[tuple[dict[str, Tensor], int]]):
 
     def count_steps(self, budget: Budget) -> int:
         """Steps over all captures."""
-        each = self.settings.schedule.steps
-        return each * len(self.fits) if budget.steps is None else budget.steps
+        if budget.steps is not None:
+            return budget.steps
+        return sum(fit.count_steps(budget) for fit in self.fits)
 
     def batches(self) -> Iterator[tuple[int, Tensor]]:
         """Which capture the next step is taken on, and on which of its frames."""

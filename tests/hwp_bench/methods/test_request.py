@@ -25,6 +25,7 @@ from hwp_bench.methods.request import (
     ORACLE_INPUTS,
     choose_training_inputs,
     frame_choice,
+    frames_of_true_poses,
     known_oracle_inputs,
     open_request,
     write_request,
@@ -171,11 +172,15 @@ def test_poses_are_true_in_the_frames_that_are_asked_for(capture: Capture) -> No
     for name, rows in (("poses", SPLIT.train), ("test-poses", [*SPLIT.validation, *SPLIT.test])):
         hand = choose_training_inputs(capture, SPLIT, frame_choice([name])).hands["right"]
         others = np.setdiff1d(np.arange(20), rows)
+        told = frames_of_true_poses(SPLIT, frame_choice([name]))
+        np.testing.assert_array_equal(np.flatnonzero(told), rows)
         for field in ("pose", "transl"):
             found = getattr(hand, field)
             np.testing.assert_array_equal(found[rows], getattr(truth, field)[rows])
             np.testing.assert_array_equal(found[others], getattr(estimate, field)[others])
         np.testing.assert_array_equal(hand.betas, estimate.betas)
+    for choice in ("perturbed", "clean", frame_choice(["betas", "masks"])):
+        assert not frames_of_true_poses(SPLIT, choice).any()
 
 
 def test_betas_alone_are_replaced(capture: Capture) -> None:

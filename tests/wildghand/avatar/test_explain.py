@@ -17,10 +17,12 @@ import wildghand
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.images import read_rgb
 from hwp_bench.capture import Capture
+from hwp_bench.hands import HandParameters
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import save_avatar
 from wildghand.avatar.render import explain_frames, explanation_sheet, temporal_weights
 from wildghand.cli.main import main
+from wildghand.fitting import start
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +48,33 @@ def test_biases_show_and_the_canonical_hand_is_the_avatars(fitted) -> None:
     assert change[0] > 0.01
     assert change[2] < -0.01
     assert found.image.shape == found.biased.shape
+
+
+def test_the_canonical_hand_stands_as_the_avatar_draws_it(
+    make_painted: Callable[..., Capture], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Oracle: the avatar's own drawing, where it adds nothing but its hand. The fit has corrected
+    # poses, and frames have poses of their own in both ways.
+    capture = make_painted()
+
+    def bent(templates: object, hands: dict[str, HandParameters], *_: object) -> object:
+        return {side: dataclasses.replace(h, pose=h.pose + 0.1) for side, h in hands.items()}
+
+    monkeypatch.setattr(start, "believed_hands", bent)
+    alone = {"visibility.enabled": False, "light.enabled": False, "dpd.poses": True}
+    avatar = wildghand.fit(capture.root, settings=UNJUDGED | alone, steps=2, all_frames=True)
+    frame = avatar.record.frames[3]
+    (before,) = explain_frames(avatar, capture, [frame])
+    with torch.no_grad():
+        avatar.model.pose_steps.fill_(0.05)
+        for module in avatar.model.biases:
+            assert module.pose_head is not None
+            module.pose_head[2].bias.fill_(1.0)
+            module.get_buffer("bounds").fill_(0.05)
+    (found,) = explain_frames(avatar, capture, [frame])
+    drawn = avatar.render(capture.hand_poses(frame), capture.camera(frame))[..., :3]
+    np.testing.assert_allclose(found.canonical, drawn, atol=1e-3)
+    assert np.abs(found.biased - before.biased).max() > 0.05
 
 
 def test_the_frames_of_largest_omega_are_shown_in_order(fitted) -> None:

@@ -13,18 +13,22 @@ from pathlib import Path
 import numpy as np
 import pygltflib
 import pytest
+import torch
 from painted import SilentReport
-from tiny_fits import QUICK
+from tiny_fits import QUICK, UNJUDGED
 
 from hwp_bench.capture import Capture
 from hwp_bench.hands import HandParameters
 from hwp_bench.methods.contract import Budget, TrainingCapture
+from hwp_bench.methods.request import frame_choice
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import load_avatar, save_avatar
 from wildghand.export.formats import ExportSettings, export
 from wildghand.fitting import start
+from wildghand.fitting.components import make_fit
 from wildghand.fitting.method import WildGHandMethod
 from wildghand.model import terms
+from wildghand.model.settings import read_settings
 from wildghand.page.write import PageSettings, sample_poses
 from wildghand.poses import ClipPoses
 from wildghand.viewer.posed_view import Motion
@@ -43,7 +47,7 @@ def _bent(hands: dict[str, HandParameters]) -> dict[str, HandParameters]:
 @pytest.fixture
 def believing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fits believe in bent fingers."""
-    monkeypatch.setattr(start, "believed_hands", lambda templates, hands, cameras: _bent(hands))
+    monkeypatch.setattr(start, "believed_hands", lambda templates, hands, *_: _bent(hands))
 
 
 def _fitted(training: TrainingCapture, **changes: object) -> WildGHandAvatar:
@@ -87,6 +91,24 @@ def test_an_avatar_keeps_what_it_believes_in_its_file(
     where = training.hand_poses(3), training.camera(3)
     np.testing.assert_array_equal(avatar.render(*where), read.render(*where))
     assert read.model.clip_poses is not None
+
+
+@pytest.mark.parametrize("name", ["poses", "test-poses"])
+def test_a_fit_says_in_which_frames_an_error_budget_gives_true_poses(
+    name: str, make_training: TrainingMaker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    training = make_training("right")
+    training.run = dataclasses.replace(training.run, frames=frame_choice([name]))
+    told: list[np.ndarray] = []
+
+    def believed(templates: object, hands: object, cameras: object, exact: np.ndarray) -> object:
+        told.append(np.flatnonzero(exact))
+        return hands
+
+    monkeypatch.setattr(start, "believed_hands", believed)
+    make_fit(training, read_settings(UNJUDGED), 0, torch.device("cpu"))
+    others = [*training.validation, *training.targets]
+    assert [*told[0]] == [*(training.split.train if name == "poses" else others)]
 
 
 def test_clips_that_tell_nothing_are_fitted_as_they_are_given(make_training: TrainingMaker) -> None:

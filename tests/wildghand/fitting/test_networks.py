@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,15 +23,22 @@ from hwp_bench.commitments.publication import open_captures
 from hwp_bench.evaluation.capture_evaluation import EvaluationSettings
 from hwp_bench.evaluation.evaluate import make_plan, with_setting_files
 from hwp_bench.methods import find_method, read_manifest
-from hwp_bench.methods.contract import RunSettings, TrainingCapture
+from hwp_bench.methods.contract import REQUEST, Budget, RunSettings, TrainingCapture
+from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import load_avatar
 from wildghand.cli.main import main as wildghand
+from wildghand.fitting import fit_capture
 from wildghand.fitting.components import make_fit
 from wildghand.fitting.fit import StepBatch
 from wildghand.fitting.judging import hand_masks, hand_roots
-from wildghand.fitting.method import check_networks
+from wildghand.fitting.method import check_networks, digest_of_named_files
+from wildghand.fitting.session import digest_of_request
+from wildghand.from_video import VideoFit
+from wildghand.from_video.run import VideoJob
+from wildghand.from_video.stages import FitStage
 from wildghand.model.settings import read_settings
 from wildghand.pao.sam import AutomaticSettings
+from wildghand.prior.prior import DESCRIPTION
 
 #: Bending and shadows come before what the networks are for, and take longer.
 FIT: dict[str, Any] = {
@@ -244,3 +252,55 @@ def test_a_network_for_a_term_of_weight_0_is_refused(
 ) -> None:
     with pytest.raises(UsageError, match=r"terms\.perceptual is 0"):
         weights(make_training(), perceptual=f"vgg19:{folder / 'vgg19.pth'}")
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"pao.regions": "sam:PLACE/weights"},
+        {"pao.hand": "sam:PLACE"},
+        {"perceptual": "vgg19:PLACE/weights"},
+        {"prior": "PLACE"},
+    ],
+    ids=lambda settings: next(iter(settings)),
+)
+def test_a_file_of_another_content_under_the_same_name_is_noticed(
+    settings: dict[str, str], make_painted: Callable[..., Capture], tmp_path: Path
+) -> None:
+    capture, place = make_painted(), tmp_path / "place"
+    place.mkdir()
+    (place / DESCRIPTION).write_text("{}")
+    named = {name: value.replace("PLACE", str(place)) for name, value in settings.items()}
+    job = VideoJob(tmp_path / "hand.mp4", tmp_path / "hand", VideoFit(settings=named))
+    job.capture = capture.root
+    request = tmp_path / "request"
+    request.mkdir()
+    (request / REQUEST).write_text("{}")
+
+    def told() -> list[object]:
+        chosen = read_settings(named)
+        saved = digest_of_request(request, capture, chosen)
+        return [digest_of_named_files(chosen), FitStage().facts(job), saved]
+
+    (place / "weights").write_bytes(b"one")
+    first, again = told(), told()
+    (place / "weights").write_bytes(b"another")
+    assert first == again
+    assert all(one != other for one, other in zip(first, told(), strict=True))
+
+
+def test_a_finished_avatar_of_another_checkpoint_is_not_taken(
+    folder: Path, make_painted: Callable[..., Capture], tmp_path: Path
+) -> None:
+    weights = Path(shutil.copy(folder / "vgg19.pth", tmp_path / "vgg19.pth"))
+    settings = {**FIT, "terms.perceptual": 0.001, "perceptual": f"vgg19:{weights}"}
+
+    def fitted() -> WildGHandAvatar:
+        source, budget = make_painted().root, Budget(steps=1)
+        return fit_capture(source, tmp_path / "avatar", settings=settings, budget=budget)
+
+    made = fitted().model.snapshot()
+    assert all(torch.equal(value, made[name]) for name, value in fitted().model.snapshot().items())
+    weights.write_bytes(weights.read_bytes() + b"0")
+    with pytest.raises(UsageError, match="exists"):
+        fitted()

@@ -6,6 +6,8 @@ frames, torch's own optimizer.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,19 +16,24 @@ import numpy as np
 import pytest
 import torch
 from odd_fits import odd_fit, part
-from painted import TrainingMaker
+from painted import SilentReport, TrainingMaker
 from tiny_fits import TINY
 
 from hwp_bench.capture import HandModelId
 from hwp_bench.hands import pose_hand, project
 from hwp_bench.methods.contract import Budget, TrainingCapture
+from wildghand.fitting.disentangle import Dpd
 from wildghand.fitting.fit import Component, Fit, StepBatch
 from wildghand.fitting.method import affordable
 from wildghand.fitting.objective import Reconstruction, Regularisers, choose_perceptual
 from wildghand.fitting.start import StartFromPrior
 from wildghand.fitting.weights import Pao
+from wildghand.gaussians.fit_loop import Loss
 from wildghand.gaussians.regularizers import surface_laplacian
+from wildghand.model import terms
+from wildghand.model.frames import HandState
 from wildghand.model.settings import read_settings
+from wildghand.plain import loop
 
 ROWS = torch.tensor([0, 3])
 
@@ -121,6 +128,32 @@ def test_the_loss_is_the_sum_of_its_terms(mode: str, make_training: TrainingMake
     assert total == pytest.approx(sum(sum(s.values()) for s in expected.values()), rel=1e-5)
 
 
+def test_in_paper_a_frame_whose_omega_is_dropped_has_no_temporal_factor(
+    make_training: TrainingMaker,
+) -> None:
+    # Oracle: lambda_u of omega = 0 in the frame that is dropped, 1 / (1 + beta |omega|) of it else.
+    # Thresholds of the background are below every error, so that W has lambda_u alone.
+    fit = fit_of(make_training(), "paper")
+    part(fit, Pao).weights.T_b.data.fill_(-1.0)
+    part(fit, Dpd).drop = (torch.arange(len(fit.data.frames)) == 3).float()
+    batch = StepBatch(ROWS)
+    omega = fit.model.biases[0].temporal(ROWS).omega.detach()
+    assert omega.abs().min() > 1e-4
+    drawing = fit.draw(batch)
+    kept = fit.draw(replace(batch, stepping=True))
+    for drawn, left in ((drawing, [True, True]), (kept, [True, False])):
+        expected = omega * torch.tensor(left)
+        torch.testing.assert_close(drawn.omega.detach(), expected, rtol=0, atol=0)
+        found = fit.compare(batch, replace(drawing, hands=drawn.hands)).weights
+        factor = 1.0 / (1.0 + 1000.0 * expected.abs())
+        plain = fit.compare(batch, replace(drawing, hands=_without_omega(drawn.hands))).weights
+        torch.testing.assert_close(found, plain * factor[:, None, None], rtol=1e-5, atol=1e-6)
+
+
+def _without_omega(hands: Mapping[str, HandState]) -> dict[str, HandState]:
+    return {side: replace(hand, omega=0.0 * hand.omega) for side, hand in hands.items()}
+
+
 @pytest.mark.parametrize("mode", ["paper", "released"])
 def test_the_terms_without_frames_are_the_template_and_the_texture(
     mode: str, make_training: TrainingMaker
@@ -207,6 +240,28 @@ def test_adam_is_torchs_with_its_own_constants(mode: str, make_training: Trainin
         if pairs:
             torch.optim.Adam(pairs, lr=group["start"]).step()
     assert max(float((a - b).detach().abs().max()) for a, b in given) < 1e-7
+
+
+def test_a_fit_whose_loss_falls_below_zero_goes_on(
+    make_training: TrainingMaker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Oracle: without the reward the loss is what it was. Windows of four steps; the reward of
+    # weights is raised after the first, so that the second one's mean loss is below 0.
+    monkeypatch.setattr(loop, "WINDOW", 4)
+    fit = fit_of(make_training(), "paper")
+    kept = dict(terms.WEIGHTS)
+    losses: list[float] = []
+
+    def raise_reward(step: int, watchers: loop.Watchers, told: Loss) -> None:
+        losses.append(float(fit.loss(StepBatch(ROWS)).detach()))
+        assert float(told) > 0.0
+        if step == 4:
+            raised = replace(kept["paper"], weight_reward=1e4)
+            monkeypatch.setattr(terms, "WEIGHTS", {**kept, "paper": raised})
+
+    avatar = loop.run_fit(fit, Budget(steps=12), SilentReport(), after_step=raise_reward)
+    assert min(losses[:4]) > 0.0 > max(losses[4:])
+    assert avatar.record.steps == 12
 
 
 @pytest.mark.parametrize(

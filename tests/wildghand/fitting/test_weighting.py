@@ -191,6 +191,31 @@ def test_omega_starts_where_the_prepass_weight_puts_it(make_training: TrainingMa
     assert 0.0196 - 1e-4 <= float(factor.min()) < float(factor.max()) <= 1.0
 
 
+def test_only_poses_that_disagree_with_their_mask_are_refined_in_a_batch_of_both(
+    make_training: TrainingMaker,
+) -> None:
+    fit = fit_of(make_training(), **{"schedule.batch": 2})
+    judged = part(fit, Prepass)
+    judged._refine_pose = torch.zeros(len(fit.data.frames), dtype=torch.bool)
+    judged._refine_pose[3] = True
+    for step in range(3):
+        fit.step(ROWS, step / 3)
+    for steps in (fit.model.pose_steps, fit.model.transl_steps):
+        moved = steps.detach().abs().amax(dim=(0, *range(2, steps.ndim)))
+        assert moved.nonzero().flatten().tolist() == [3]
+
+
+@pytest.mark.parametrize("judged", [True, False])
+def test_an_avatar_says_which_frames_are_clean_where_they_were_judged(
+    judged: bool, make_training: TrainingMaker
+) -> None:
+    fit = fit_of(make_training(), **{"prepass.enabled": judged})
+    record = fit.avatar(0).record
+    found = fit.data.judgement
+    assert record.clean == (found.clean.tolist() if judged else [])
+    assert record.frame_weights == (found.frame_weights.tolist() if judged else [])
+
+
 def test_without_heads_the_template_stands_and_nothing_else_changes(
     make_training: TrainingMaker,
 ) -> None:

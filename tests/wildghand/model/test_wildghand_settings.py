@@ -126,6 +126,18 @@ def test_without_heads_the_rest_stays() -> None:
     assert made == dataclasses.replace(read_settings({}), heads=False)
 
 
+@pytest.mark.parametrize(
+    ("values", "name", "idle"),
+    [
+        ({"mode": "released", "heads": False}, "dpd.poses", False),
+        ({"pao.variant": "binary", "pao.regions": "sam:/x"}, "pao.regions", "superpixels"),
+    ],
+    ids=str,
+)
+def test_what_has_no_effect_is_off(values: dict[str, Any], name: str, idle: object) -> None:
+    assert value_of(read_settings(values), name) == idle
+
+
 def test_the_size_chooses_the_network() -> None:
     made = read_settings({"network": {"size": "paper"}, "network.plane_resolution": 64})
     assert made.network.build() == network_settings("paper", plane_resolution=64)

@@ -14,6 +14,7 @@ from hwp_bench.capture import Cameras
 from hwp_bench.hands import HandParameters, load_template
 from hwp_bench.hands.poses import posed_skeleton, rest_skeleton, turned
 from wildghand.poses import ClipPoses, believe, believed_hands
+from wildghand.poses.believe import _rows
 from wildghand.poses.errors import (
     error_size,
     extent_in,
@@ -60,13 +61,15 @@ def _with_errors(truth: HandParameters, size: float, seed: int = 1) -> HandParam
     return replace(truth, pose=pose, transl=truth.transl + errors[:, 48:])
 
 
-def _believed(hand: HandParameters, **changes: float) -> HandParameters:
+def _believed(
+    hand: HandParameters, exact: np.ndarray | None = None, **changes: float
+) -> HandParameters:
     """With some of the constants changed."""
     cameras = _cameras(hand.frame_count)
     with pytest.MonkeyPatch.context() as patch:
         for name, value in changes.items():
             patch.setattr(believe, name, value)
-        return believed_hands({"right": TEMPLATE}, {"right": hand}, cameras)["right"]
+        return believed_hands({"right": TEMPLATE}, {"right": hand}, cameras, exact)["right"]
 
 
 def _turns(hand: HandParameters, truth: HandParameters) -> float:
@@ -97,6 +100,25 @@ def test_exact_poses_stay_as_they_are() -> None:
     truth = _truth()
     # Five ways of moving leave forty directions that nothing moves along.
     assert _believed(truth) is truth
+
+
+@pytest.mark.parametrize("share", [0.2, 0.6])
+def test_frames_of_true_poses_stay_and_the_others_are_corrected_as_well(share: float) -> None:
+    # Oracle: the truth; and the correction of the same frames without the true ones.
+    truth = _truth(frames=300)
+    given = _with_errors(truth, 1.0)
+    exact = np.random.default_rng(2).random(300) < share
+    mixed = replace(given, pose=np.where(exact[:, None, None], truth.pose, given.pose))
+    mixed = replace(mixed, transl=np.where(exact[:, None], truth.transl, given.transl))
+    found = _believed(mixed, exact)
+    np.testing.assert_array_equal(found.pose[exact], truth.pose[exact])
+    np.testing.assert_array_equal(found.transl[exact], truth.transl[exact])
+
+    def error(hand: HandParameters) -> float:
+        return _turns(_rows(hand, ~exact), _rows(truth, ~exact))
+
+    assert error(found) < 0.6 * error(given)
+    assert error(found) <= 1.02 * error(_believed(given))
 
 
 def test_small_errors_are_left_alone() -> None:

@@ -179,6 +179,31 @@ def test_the_same_seed_repeats_and_a_stopped_run_goes_on(
     assert all(torch.equal(expected_weights[name], value) for name, value in weights.items())
 
 
+@pytest.mark.parametrize(
+    ("changes", "each"), [({"schedule.epochs": 3}, None), ({"schedule.steps": 7}, 7)], ids=str
+)
+def test_a_run_without_a_number_has_the_steps_of_a_fit_for_each_capture(
+    changes: dict[str, int], each: int | None, subjects: dict[str, Path], tmp_path: Path
+) -> None:
+    # Oracle: one frame a step, so that an epoch has as many steps as there are training frames.
+    trainings = [training_of(subjects[name], tmp_path) for name in ("anna", "ben")]
+    joint = JointFit(trainings, read_settings({**QUICK, **changes}), 0, CPU)
+    expected = sum(each or 3 * len(training.train) for training in trainings)
+    assert joint.count_steps(Budget()) == expected
+    assert joint.count_steps(Budget(steps=5)) == 5
+
+
+def test_a_prior_says_which_settings_ran_and_refuses_others(
+    subjects: dict[str, Path], prior: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    schedule = json.loads((prior / DESCRIPTION).read_text())["settings"]["schedule"]
+    fixed = {"texture_every": 1, "average_share": 0.0, "validated": False}
+    assert {name: schedule[name] for name in fixed} == fixed
+    for word in ("texture_every=8", "average_share=0.1", "validated=true"):
+        assert make_prior(subjects, tmp_path / "other", "--set", f"schedule.{word}") == 2
+        assert f"schedule.{word.partition('=')[0]}" in capsys.readouterr().err
+
+
 def test_the_commands_use_a_prior(
     subjects: dict[str, Path], prior: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
