@@ -93,7 +93,7 @@ class _Clock:
 
 def unfinished(out: Path, ending: str = ".fit") -> Path:
     """Return the folder of the state of a fit to an output folder, until it is finished."""
-    named = Path(os.path.abspath(out))  # A folder may be given as `.`, which is no name.
+    named = Path(os.path.abspath(out))  # `.` has no name.
     return named.with_name(named.name + ending)
 
 

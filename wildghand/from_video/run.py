@@ -125,7 +125,7 @@ def with_quick(settings: Mapping[str, Any], *, quick: bool) -> dict[str, Any]:
 def stride(count: int, most: int) -> int:
     """Return the distance between imported frames.
 
-    It is the nearest whole number to `count / most`: less than half more than `most` frames are
+    It is the integer nearest to `count / most`: less than half more than `most` frames are
     imported of `count`.
     """
     return max(1, round(count / most))
