@@ -29,6 +29,7 @@ from hwp_bench.base.files import (
     atomic_write,
     inside,
     read_json,
+    refuse_other,
     sha256_json,
     write_json,
 )
@@ -311,6 +312,11 @@ def load_matching_template(
     return first if side == sides[0] else load_template(model.source, side)
 
 
+def refuse_no_capture(path: str | os.PathLike[str]) -> None:
+    """Refuse the place of a capture where something else is."""
+    refuse_other(path, "a capture", lambda folder: (folder / METADATA).is_file())
+
+
 class CaptureWriter:
     """A context manager that fills a capture folder.
 
@@ -323,10 +329,10 @@ class CaptureWriter:
         info: description of the capture; digests are filled in.
         hands: parameters by side, as a method is given them.
         cameras: one camera a frame.
-        overwrite: replace an existing folder.
+        overwrite: replace an existing capture.
 
     Raises:
-        UsageError: the folder exists.
+        UsageError: the folder exists, or holds something else than a capture.
         BadCapture: parameters, cameras and `info` contradict each other.
     """
 
@@ -339,6 +345,7 @@ class CaptureWriter:
         *,
         overwrite: bool = False,
     ) -> None:
+        refuse_no_capture(path)
         self.path = Path(path)
         self.info = CaptureInfo.from_json(info.to_json(), where=os.fspath(path))
         self._check_hands(hands)
