@@ -433,6 +433,9 @@ def write_json(path: str | os.PathLike[str], value: Any) -> Path:
 def inside(root: str | os.PathLike[str], relative: str) -> Path:
     """Join a path from outside to a folder, refusing whatever leads out of the folder."""
     base = Path(root).resolve()
+    if "\0" in relative:
+        said = f"the path {relative[:80]!r} holds a zero character"
+        raise BadInput(said, where=root, remedy="Use the name of a file.")
     target = (base / relative).resolve()
     if Path(relative).is_absolute() or not target.is_relative_to(base):
         raise BadInput(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import trimesh
 from hwp_bench.base.errors import ShapeMismatch, UsageError
 from hwp_bench.base.files import atomic_write
 from hwp_bench.capture.folder import Capture, identify_hand_model, rewrite_capture
+from hwp_bench.capture.schema import CaptureInfo
 from hwp_bench.hands.anchors import to_trimesh
 from hwp_bench.hands.fitting import FitTargets, fit_hand
 from hwp_bench.hands.skeleton import HandParameters
@@ -38,19 +40,22 @@ class ConversionError:
 
 
 def convert_hand(
-    hand: HandParameters, source: HandTemplate, target: HandTemplate
+    hand: HandParameters,
+    source: HandTemplate,
+    target: HandTemplate,
+    betas: np.ndarray | None = None,
 ) -> tuple[HandParameters, ConversionError]:
-    """Express a hand in another hand model."""
+    """Express a hand in another hand model, with the shape (10,) that is given, or a fitted one."""
     if source.side != target.side:
         raise UsageError(f"a {source.side} hand is not a {target.side} hand", field="target")
     posed = pose_parameters(source, hand)
     # Both wrists in the same place; the joints' axes agree between the models.
-    unshaped = replace(hand, betas=np.zeros(10))
+    unshaped = replace(hand, betas=np.zeros(10) if betas is None else betas)
     shift = (posed.joints[:, 0] - pose_parameters(target, unshaped).joints[:, 0]).numpy()
     start = replace(unshaped, transl=hand.transl + shift)
     step = max(1, len(source.vertices) // SKIN_POINTS)
     targets = FitTargets(posed.landmarks.numpy(), skin=posed.vertices[:, ::step].numpy())
-    fitted = fit_hand(target, targets, start)
+    fitted = fit_hand(target, targets, start, keep_shape=betas is not None)
     return fitted.parameters, ConversionError(
         landmark_mm=float(np.nanmean(fitted.landmark_mm)),
         skin_mm=float(np.nanmean(fitted.skin_mm)),
@@ -91,20 +96,35 @@ def with_one_shape(
 def convert_capture(
     capture: Capture, out: str | os.PathLike[str], source: str, *, overwrite: bool = False
 ) -> dict[str, ConversionError]:
-    """Write a capture again with its hands in another hand model; images stay as they are."""
+    """Write a capture again with its hands in another hand model; images stay as they are.
+
+    Returned are the errors of the capture. Those of its free-view clip stand in the clip.
+    """
+    clip = capture.free_view
+    info, hands, errors = _converted(capture, source)
+    # An avatar has one shape, so that the clip has that of the capture.
+    shapes = {side: hand.betas for side, hand in hands.items()}
+    free_view = None if clip is None else (clip, *_converted(clip, source, shapes)[:2])
+    rewrite_capture(capture, out, info, hands, free_view=free_view, overwrite=overwrite)
+    return errors
+
+
+def _converted(
+    capture: Capture, source: str, shapes: Mapping[str, np.ndarray] | None = None
+) -> tuple[CaptureInfo, dict[str, HandParameters], dict[str, ConversionError]]:
+    """The description and the hands of a capture in another model; `shapes` are kept by side."""
     info = capture.info
     made, errors = {}, {}
     for side, hand in capture.hands.items():
-        target = load_template(source, side)
-        made[side], errors[side] = convert_hand(hand, capture.template(side), target)
+        target, betas = load_template(source, side), None if shapes is None else shapes[side]
+        made[side], errors[side] = convert_hand(hand, capture.template(side), target, betas)
     note = {side: vars(error) for side, error in errors.items()}
     changed = replace(
         info,
         hand_model=identify_hand_model(source, info.hands),
         source={**info.source, "converted": {"from": info.hand_model.name, "error": note}},
     )
-    rewrite_capture(capture, out, changed, made, overwrite=overwrite)
-    return errors
+    return changed, made, errors
 
 
 #: Mesh formats by the ending of the file; of these only `.glb` keeps two hands apart by name.

@@ -466,15 +466,22 @@ def rewrite_capture(
     info: CaptureInfo,
     hands: Mapping[str, HandParameters],
     *,
+    free_view: tuple[Capture, CaptureInfo, Mapping[str, HandParameters]] | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Copy a capture with other hands. True hands are left out: they are of the old model."""
+    """Copy a capture with other hands, and in it a free-view clip with other hands.
+
+    True hands are left out: they are of the old model.
+    """
     with CaptureWriter(out, info, hands, capture.cameras, overwrite=overwrite) as writer:
         kinds = ["frames", "masks", *["true_masks"] * capture.has_true_masks]
         kinds += ["clean", "clean_masks"] * capture.has_clean
         for frame in range(len(capture)):
             for kind in kinds:
                 writer.image(kind, frame, capture.image(kind, frame))
+        if free_view is not None:
+            clip, clip_info, clip_hands = free_view
+            rewrite_capture(clip, writer.folder / FREE_VIEW, clip_info, clip_hands)
 
 
 def combine(digests: Iterable[str]) -> str:

@@ -410,7 +410,8 @@ _CONVERT = """examples:
   hwp-bench data convert mano_capture -o as_free --hand-model anny --json
 
 Writes the capture again with its hands in another hand model, by fitting, and prints the errors
-of the fit. True hand parameters are left out: they belong to the old model.
+of the fit. A free-view clip in it is converted too, with the shape of the capture's hands. True
+hand parameters are left out: they belong to the old model.
 """
 
 

@@ -59,12 +59,23 @@ class FittedHand:
     skin_mm: np.ndarray
 
 
-def fit_hand(template: HandTemplate, targets: FitTargets, start: HandParameters) -> FittedHand:
-    """Fit pose, one shape and translation, by Adam from a start; all frames at once."""
+def fit_hand(
+    template: HandTemplate,
+    targets: FitTargets,
+    start: HandParameters,
+    *,
+    keep_shape: bool = False,
+) -> FittedHand:
+    """Fit pose, one shape and translation, by Adam from a start; all frames at once.
+
+    With `keep_shape` the shape stays that of the start.
+    """
     if not start.valid.any() or (targets.landmarks is None and targets.skin is None):
         raise BadInput("no frame is valid, or no points are known", field="targets")
     chosen = np.flatnonzero(start.valid)
     fit = _Fit(template, targets, start, chosen)
+    if keep_shape:
+        del fit.rates["betas"]
     fit.run(_LANDMARK_STEPS, skin=False)
     if targets.skin is not None:
         fit.run(_SKIN_STEPS, skin=True)
@@ -134,13 +145,14 @@ class _Fit:
         self.pose = torch.tensor(start.pose[chosen], requires_grad=True)
         self.betas = torch.tensor(start.betas, requires_grad=True)
         self.transl = torch.tensor(start.transl[chosen], requires_grad=True)
+        self.rates = {"pose": 0.03, "betas": 0.05, "transl": 0.004}
 
     def run(self, steps: int, *, skin: bool) -> None:
         """Take `steps` steps, with the skin or without it."""
-        rates = {"pose": 0.03, "betas": 0.05, "transl": 0.004}
         factor = 0.3 if skin else 1.0
         groups = [
-            {"params": [getattr(self, name)], "lr": rate * factor} for name, rate in rates.items()
+            {"params": [getattr(self, name)], "lr": rate * factor}
+            for name, rate in self.rates.items()
         ]
         matches: tuple[torch.Tensor, ...] = ()
 

@@ -198,14 +198,14 @@ class _Annotations:
         data, where = _Record(read_json(path, max_bytes=MAX_BYTES), path), path.parent
         named = (str(sequence.capture), sequence.name, str(sequence.camera))
         chosen = {
-            image.get("id"): image
+            data.key(image, "id"): image
             for image in data.objects("images")
             if (str(image.get("capture")), image.get("seq_name"), str(image.get("camera"))) == named
         }
         types = {
-            item.get("image_id"): item.get("hand_type")
+            key: item.get("hand_type")
             for item in data.objects("annotations")
-            if item.get("image_id") in chosen
+            if (key := data.key(item, "image_id")) in chosen
         }
         rows = []
         for key, image in chosen.items():
@@ -307,6 +307,14 @@ class _Record:
         if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
             raise BadInput("is not a list of objects", where=self.path, field=self._place(name))
         return value
+
+    def key(self, item: dict[str, Any], name: str) -> int | str:
+        """The number or name by which an object in it is found."""
+        value = item.get(name)
+        if isinstance(value, int | str):
+            return value
+        said = f"is {str(value)[:40]!r}, not a number or a name"
+        raise BadInput(said, where=self.path, field=self._place(name))
 
     def numbers(self, name: str, shape: tuple[int, ...], *, flat: bool = False) -> np.ndarray:
         """Numbers in it."""

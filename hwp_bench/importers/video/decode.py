@@ -250,7 +250,14 @@ def read_masks(
     for path in sorted(folder.iterdir()):
         number = re.search(r"(\d+)$", path.stem)
         if number and path.suffix.lower() in (".png", ".jpg", ".jpeg", ".bmp"):
-            numbered[int(number[1])] = path
+            other = numbered.setdefault(int(number[1]), path)
+            if other != path:
+                raise BadInput(
+                    f"has two masks of frame {int(number[1])}: {other.name} and {path.name}",
+                    where=folder,
+                    field="--masks",
+                    remedy="Give a folder with one mask a frame.",
+                )
     missing = [int(frame) for frame in indices if int(frame) not in numbered]
     if missing:
         raise BadInput(

@@ -195,7 +195,9 @@ def say_faults(source: VideoSource, out: str | os.PathLike[str], options: VideoI
     Raises:
         BadInput: by `options.strict`, nothing useful can come of it.
     """
-    place = Path(out).with_name(f"{Path(out).name}_tracked.jpg")
+    # The folder `.` has a name only in full.
+    whole = Path(out).absolute()
+    place = whole.with_name(f"{whole.name}_tracked.jpg")
     place.unlink(missing_ok=True)
     qualities = {side: measure(source, hand) for side, hand in source.hands.items()}
     faults = [

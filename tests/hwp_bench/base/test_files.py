@@ -215,6 +215,8 @@ def test_paths_out_of_a_folder_are_refused(tmp_path: Path, path: str) -> None:
     (root / "link").symlink_to(tmp_path)
     with pytest.raises(BadInput, match="leads out of the folder"):
         inside(root, path)
+    with pytest.raises(BadInput, match="holds a zero character"):
+        inside(root, "a\0b")
     assert inside(root, "a/../b") == root / "b"
 
 

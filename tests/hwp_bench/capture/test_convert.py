@@ -106,6 +106,8 @@ def test_the_command_rewrites_a_capture(
     plain = make_capture(frames=10, truth=True)
     info = replace(plain.info, hand_model=HandModelId(free_right.name, free_right.digest))
     rewrite_capture(plain, tmp_path / "sound", info, {"right": bent(10)})
+    of_clip = replace(info, id="tiny-free")
+    rewrite_capture(plain, tmp_path / "sound" / "free", of_clip, {"right": bent(10)})
     source, out = str(tmp_path / "sound"), str(tmp_path / "as_mano")
     words = ["data", "convert", source, "-o", out, "--hand-model"]
     assert main([*words, f"mano:{mano_folder}", "--json"]) == 0
@@ -117,6 +119,13 @@ def test_the_command_rewrites_a_capture(
     assert made.info.source["converted"]["from"] == "anny-1"
     assert made.true_hands is None
     np.testing.assert_array_equal(made.frame(3), plain.frame(3))
+    # The free-view clip goes along, in the same shape.
+    free = made.free_view
+    assert free is not None
+    np.testing.assert_array_equal(free.hands["right"].betas, made.hands["right"].betas)
+    np.testing.assert_array_equal(free.frame(3), plain.frame(3))
+    told = free.info.source["converted"]["error"]["right"]
+    assert told["skin_mm"] == pytest.approx(error["skin_mm"], rel=0.2)
     assert main([*words, "anny"]) == 2
     old = replace(plain.info, hand_model=HandModelId(free_right.name, "0" * 64))
     rewrite_capture(plain, tmp_path / "old", old, {"right": bent(10)})

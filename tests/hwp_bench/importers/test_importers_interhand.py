@@ -131,6 +131,9 @@ def edit(root: Path, kind: str, change) -> None:
         ("data", lambda v: v["images"][0].update(frame_idx="x"), "frame_idx"),
         ("data", lambda v: v["images"][1].update(frame_idx=7), "twice"),
         ("data", lambda v: v.update(images={}), "images"),
+        ("data", lambda v: v["images"][0].update(id=[0]), r"data\.json: id: is '\[0\]', not a"),
+        ("data", lambda v: v["annotations"][0].update(image_id=[0]), r"image_id: is '\[0\]', not"),
+        ("data", lambda v: v["images"][0].update(file_name="a\0.jpg"), "holds a zero character"),
     ],
 )
 def test_damaged_annotations_are_named(

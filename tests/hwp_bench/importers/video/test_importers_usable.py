@@ -121,6 +121,15 @@ def test_of_a_sound_video_nothing_is_said(
     assert not (tmp_path / "capture_tracked.jpg").exists()
 
 
+def test_the_folder_that_one_is_in_has_a_name(
+    tmp_path: Path, sound: VideoSource, clip: SyntheticClip, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "mine").mkdir()
+    monkeypatch.chdir(tmp_path / "mine")
+    say_faults(spoilt(sound, clip, darkened, FRAMES), ".", VideoImport())
+    assert (tmp_path / "mine_tracked.jpg").is_file()
+
+
 SPOILT = [
     (smaller, r"the right hand is 4\d px large in a typical frame, 60 are needed"),
     (lifted, r"the right hand is cut off in {} of 10 frames"),

@@ -308,6 +308,15 @@ def test_black_frames_show_no_hand(
     np.testing.assert_array_equal(np.flatnonzero(~source.detected), [3, 5, 9])
 
 
+def test_two_masks_of_a_frame_are_named(folder: Path, tmp_path: Path) -> None:
+    for path in (folder / "masks").iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    (tmp_path / "obj2_000012.png").write_bytes((tmp_path / "000012.png").read_bytes())
+    said = r"--masks: has two masks of frame 12: 000012\.png and obj2_000012\.png"
+    with pytest.raises(BadInput, match=said):
+        read_source(folder / "hand.avi", folder / "hand.npz", VideoImport(masks=tmp_path))
+
+
 def test_a_mask_of_another_size_is_named(folder: Path, tmp_path: Path) -> None:
     for frame in range(FRAMES):
         write_image(tmp_path / f"{frame}.png", np.zeros((24, 32), dtype=np.uint8))
