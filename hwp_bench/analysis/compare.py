@@ -252,6 +252,9 @@ class Rank:
     #: where they contradict each other, the data allow the rank of the mean too.
     best: int
     worst: int
+    #: Labels of the methods that it is significantly better than, and worse than.
+    better_than: frozenset[str]
+    worse_than: frozenset[str]
     #: This method less the leader; None for the leader itself.
     behind: Estimate | None
 
@@ -302,14 +305,23 @@ def rank_methods(
             leads[pair], signs[pair] = lead, turn
     ranks = []
     for own in order:
-        against = [signs[own.label, other.label] for other in order if other is not own]
+        better_than, worse_than = (
+            frozenset(
+                other.label
+                for other in order
+                if other is not own and signs[own.label, other.label] == sign
+            )
+            for sign in (1, -1)
+        )
         rank = 1 + sum(direction * other.mean > direction * own.mean for other in order)
         ranks.append(
             Rank(
                 own,
                 rank,
-                min(rank, 1 + against.count(-1)),
-                max(rank, len(order) - against.count(1)),
+                min(rank, 1 + len(worse_than)),
+                max(rank, len(order) - len(better_than)),
+                better_than,
+                worse_than,
                 leads[own.label, order[0].label] if own is not order[0] else None,
             )
         )
@@ -364,12 +376,12 @@ def verdict(ranking: Ranking) -> str:
             f"{first.standing.label} leads with {mean} (macro mean): {text}; nothing says how sure."
         )
     label = first.standing.label
-    ahead, behind = _significant(ranking, label)
-    tied = [one.standing.label for one in rest if one.standing.label not in ahead | behind]
-    better = [one.standing.label for one in rest if one.standing.label in behind]
+    others = [one.standing.label for one in rest]
+    tied = [name for name in others if name not in first.better_than | first.worse_than]
+    behind = [name for name in others if name in first.worse_than]
     found = []
-    if better:
-        names = ", ".join(better)
+    if behind:
+        names = ", ".join(behind)
         found.append(f"is significantly behind {names} over the seeds that both have")
     if tied:
         found.append(f"is tied with {', '.join(tied)} (not significantly different")
@@ -377,22 +389,6 @@ def verdict(ranking: Ranking) -> str:
     return f"No clear winner: {label} leads with {mean} (macro mean), {text}, and " + (
         ", and ".join(found) + "."
     )
-
-
-def _significant(ranking: Ranking, label: str) -> tuple[set[str], set[str]]:
-    """The labels of the methods that one is significantly better than, and worse than."""
-    ahead: set[str] = set()
-    behind: set[str] = set()
-    direction = 1.0 if metric_facts(ranking.metric).higher_is_better else -1.0
-    for item in ranking.differences:
-        if not _differs(item, len(ranking.ranks)):
-            continue
-        lead = direction * item.estimate.value
-        if item.first == label:
-            (ahead if lead > 0 else behind).add(item.second)
-        elif item.second == label:
-            (behind if lead > 0 else ahead).add(item.first)
-    return ahead, behind
 
 
 _INTERVAL = (

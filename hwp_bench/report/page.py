@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from markupsafe import Markup
 
 from hwp_bench.analysis.compare import (
+    Ranking,
     compare,
     differences_table,
     rank_methods,
@@ -180,11 +181,12 @@ def gather_report(
     album = Album(image_bytes)
     plain = next((PLAIN for run in runs if run.first.method.name == PLAIN), None)
     cost = _optional(lambda: analyse_cost(runs, HEADLINE))
+    ranking = _optional(lambda: rank_methods(runs, HEADLINE))
     several = any(len(run.seeds) > 1 for run in runs)
     tables = all_tables(measured)
     shown = [
         tables["overall"],
-        _optional(lambda: rank_table(runs)) if len(runs) > 1 else None,
+        _optional(lambda: rank_table(runs, ranking)) if len(runs) > 1 else None,
         tables["perturbations"],
         tables["captures"],
         _optional(lambda: free_view_table(measured)),
@@ -199,7 +201,7 @@ def gather_report(
         return [add_isolation_note(one, results) for one in found if one and len(one.columns) > 1]
 
     return {
-        "summary": summary_sentence(runs),
+        "summary": summary_sentence(runs, ranking),
         "methods": [run.label for run in runs],
         "tables": noted(shown),
         "pareto": _pareto(cost, runs) if cost else None,
@@ -225,15 +227,15 @@ def gather_report(
     }
 
 
-def summary_sentence(runs: Sequence[MethodRuns]) -> str:
-    """Return what the results say, in words."""
+def summary_sentence(runs: Sequence[MethodRuns], ranking: Ranking | None) -> str:
+    """Return what the results say, in words; they have no ranking without common seeds."""
     first = runs[0].first
     frames = sum(len(capture.frames) for capture in first.captures)
     where = f"On {len(first.captures)} captures ({first.suite}, {frames} test frames)"
     failed = sum(c.failed_frames for run in runs for r in run.seeds.values() for c in r.captures)
     tail = f" {failed} frames failed and count with their penalties." if failed else ""
-    told = _optional(lambda: verdict(rank_methods(runs, HEADLINE)))
-    return f"{where}: {told or 'some methods have no seed in common, so none is ranked.'}{tail}"
+    told = "some methods have no seed in common, so none is ranked."
+    return f"{where}: {verdict(ranking) if ranking else told}{tail}"
 
 
 def _optional(make: Callable[[], T]) -> T | None:

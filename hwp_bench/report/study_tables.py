@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from hwp_bench.analysis.columns import Filled, block_breaks, score_column, score_title, table_of
-from hwp_bench.analysis.compare import macro_by_seed, macro_mean, rank_methods, verdict
+from hwp_bench.analysis.compare import Ranking, macro_by_seed, macro_mean, rank_methods, verdict
 from hwp_bench.analysis.cost import BUDGETS, MethodCost, method_costs
 from hwp_bench.analysis.discrimination import item_statistics
 from hwp_bench.analysis.pairing import MethodRuns, common_metrics, group_runs, refuse_unlike
@@ -32,9 +32,12 @@ from hwp_bench.taxonomy import PERTURBATIONS, perturbation
 METRIC = HEADLINE[0]
 
 
-def rank_table(runs: Sequence[MethodRuns]) -> Table:
-    """Return one row per method, best first: rank, score, distance from the first, ties."""
-    ranking = rank_methods(runs, METRIC)
+def rank_table(runs: Sequence[MethodRuns], ranking: Ranking | None = None) -> Table:
+    """Return one row per method, best first: rank, score, distance from the first, ties.
+
+    `ranking` is that of the runs by `METRIC`, where it is known already.
+    """
+    ranking = ranking or rank_methods(runs, METRIC)
     facts = metric_facts(METRIC)
     others = [name for name in common_metrics(runs, HEADLINE) if name != METRIC]
     by_label = {run.label: run for run in runs}
