@@ -470,8 +470,8 @@ def _import_hand(
         pose = mano.pose.copy()
         pose[:, 1:] += template.mean_pose.reshape(15, 3)
         annotated = pose, mano.shape, mano.transl
-        shown, _ = with_one_shape(template, *annotated, valid)
-        points = pose_parameters(template, shown).vertices.numpy()
+        hand, one_shape = with_one_shape(template, *annotated, valid)
+        points = pose_parameters(template, hand).vertices.numpy()
     far = valid & ~_near_image(points, records)
     if far.any():
         errors["far_frames"] = records.frames[far].tolist()
@@ -482,7 +482,8 @@ def _import_hand(
         valid = valid & ~far
         _refuse_unseen(valid, side, f"{what} near the image", root)
     if options.mano is not None:
-        hand, one_shape = with_one_shape(template, *annotated, valid)
+        if far.any():  # The one shape is that of the others.
+            hand, one_shape = with_one_shape(template, *annotated, valid)
         errors["one_shape_mm"] = round(float(np.nanmean(one_shape)), 3)
     else:
         pose = np.where(mano.valid[:, None, None], mano.pose, 0.0)
