@@ -29,6 +29,7 @@ from hwp_bench.base.files import (
     atomic_write,
     inside,
     read_json,
+    refuse_existing,
     refuse_other,
     sha256_json,
     write_json,
@@ -315,6 +316,12 @@ def load_matching_template(
 def refuse_no_capture(path: str | os.PathLike[str]) -> None:
     """Refuse the place of a capture where something else is."""
     refuse_other(path, "a capture", lambda folder: (folder / METADATA).is_file())
+
+
+def refuse_taken(path: str | os.PathLike[str], *, overwrite: bool) -> None:
+    """Refuse the place of a capture before minutes of work: something else, or an existing one."""
+    refuse_no_capture(path)
+    refuse_existing(path, overwrite=overwrite, flag="--overwrite")
 
 
 class CaptureWriter:

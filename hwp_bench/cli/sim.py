@@ -136,7 +136,7 @@ def _plan(args: argparse.Namespace) -> int:
 
 def _render(args: argparse.Namespace) -> int:
     """Render captures and print their folders."""
-    from hwp_bench.capture.folder import refuse_no_capture
+    from hwp_bench.capture.folder import refuse_taken
     from hwp_bench.run.engine.options import engine_for, needs_of
     from hwp_bench.sim.produce.capture import RenderRequest, ensure_suite, workers_each
 
@@ -181,10 +181,7 @@ def _render(args: argparse.Namespace) -> int:
     with engine_for(args) as engine:
         for scene in scenes:
             out = Path(args.out) / scene.id if len(scenes) > 1 else Path(args.out)
-            refuse_no_capture(out)
-            if not args.overwrite and (out.is_file() or (out.is_dir() and any(out.iterdir()))):
-                remedy = "Choose another place or --overwrite."
-                raise UsageError("exists already", where=out, remedy=remedy)
+            refuse_taken(out, overwrite=args.overwrite)
             request = RenderRequest(
                 scene,
                 args.frame_count,

@@ -23,6 +23,7 @@ from hwp_bench.base.files import check_is_file, inside, read_json
 from hwp_bench.base.images import is_blank, read_rgb
 from hwp_bench.capture import Cameras
 from hwp_bench.capture.convert import with_one_shape
+from hwp_bench.capture.folder import refuse_taken
 from hwp_bench.capture.schema import MAX_FRAMES
 from hwp_bench.hands import HandParameters, HandTemplate, load_template
 from hwp_bench.hands.fitting import FitTargets
@@ -37,7 +38,6 @@ from hwp_bench.importers.shared.output import (
     check_choices,
     fit_free_hand,
     project_hand,
-    refuse_existing,
     write_capture,
 )
 
@@ -400,7 +400,7 @@ def import_interhand(
 ) -> dict[str, Any]:
     """Make a capture of one camera of one sequence."""
     options = options or InterHandImport()
-    refuse_existing(out, overwrite=options.overwrite)
+    refuse_taken(out, overwrite=options.overwrite)
     records = read_annotations(root, sequence, options.side, mano=options.mano is not None)
     count = len(records.frames)
     facts: dict[str, Any] = {"frames": count, "hands": list(records.sides)}

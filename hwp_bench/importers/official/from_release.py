@@ -35,6 +35,7 @@ from hwp_bench.base.errors import BadInput, UsageError, bounded
 from hwp_bench.base.files import sha256_file, sha256_json
 from hwp_bench.base.images import is_blank, read_gray, read_rgb
 from hwp_bench.capture import Cameras
+from hwp_bench.capture.folder import refuse_taken
 from hwp_bench.capture.schema import check_id
 from hwp_bench.hands import HandParameters, HandTemplate, load_template
 from hwp_bench.hands.fitting import FitTargets, FittedHand
@@ -55,7 +56,6 @@ from hwp_bench.importers.shared.output import (
     fit_free_hand,
     project_hand,
     read_report,
-    refuse_existing,
     write_capture,
 )
 from hwp_bench.taxonomy import catalogue
@@ -251,7 +251,7 @@ def check_import(
 ) -> None:
     """Refuse before minutes of work what `import_official` refuses of its arguments."""
     check_id(folder.id, os.fspath(folder.path))
-    refuse_existing(out, overwrite=options.overwrite)
+    refuse_taken(out, overwrite=options.overwrite)
     if options.hand is not None and not _is_single(folder):
         raise UsageError(
             f"{folder.id} shows two hands, and both are imported",

@@ -18,9 +18,7 @@ from hwp_bench.base.console import progress
 from hwp_bench.base.drawing import labelled, outlined, sheet
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.files import read_json
-from hwp_bench.base.files import refuse_existing as refuse_folder
 from hwp_bench.capture import Cameras, CaptureInfo, CaptureWriter, identify_hand_model
-from hwp_bench.capture.folder import refuse_no_capture
 from hwp_bench.capture.schema import EXTRA, METADATA
 from hwp_bench.hands import HandParameters, HandTemplate, project
 from hwp_bench.hands.fitting import FitTargets, FittedHand, fit_hand
@@ -70,12 +68,6 @@ class ReleaseImport:
     def model(self) -> str:
         """The hand model, as `load_template` takes it."""
         return "anny" if self.mano is None else f"mano:{Path(self.mano).absolute()}"
-
-
-def refuse_existing(out: str | os.PathLike[str], *, overwrite: bool) -> None:
-    """Refuse an output folder that is not empty before minutes of work, not after them."""
-    refuse_no_capture(out)
-    refuse_folder(out, overwrite=overwrite, flag="--overwrite")
 
 
 def read_report(out: str | os.PathLike[str]) -> dict[str, Any] | None:

@@ -16,6 +16,7 @@ from hwp_bench.base.console import notice, progress
 from hwp_bench.base.errors import BadInput, UsageError, bounded
 from hwp_bench.base.files import atomic_write, sha256_file, sha256_json
 from hwp_bench.base.images import is_blank, write_image
+from hwp_bench.capture.folder import refuse_taken
 from hwp_bench.capture.schema import EXTRA, Cameras, check_id
 from hwp_bench.hands import HandParameters, load_template
 from hwp_bench.hands.skeleton import SIDES
@@ -23,7 +24,6 @@ from hwp_bench.importers.shared.landmarks import Landmarks
 from hwp_bench.importers.shared.output import (
     SHEET_NAME,
     read_report,
-    refuse_existing,
     write_capture,
 )
 from hwp_bench.importers.video.glimpse import Glimpse, paint_hand
@@ -413,7 +413,7 @@ class _Turns:
 
 def _check_output(out: Path, options: VideoImport) -> None:
     """Check the output before minutes of work, not after them."""
-    refuse_existing(out, overwrite=options.overwrite)
+    refuse_taken(out, overwrite=options.overwrite)
     check_id(options.capture_id(out), os.fspath(out))
     sheet = options.sheet
     if sheet is None:

@@ -34,7 +34,7 @@ from hwp_bench.capture import (
     HandModelId,
     open_capture,
 )
-from hwp_bench.capture.folder import refuse_no_capture
+from hwp_bench.capture.folder import refuse_taken
 from hwp_bench.capture.schema import FREE_VIEW, SIMULATED
 from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.run.engine import Engine, Job, LocalEngine, Needs
@@ -241,11 +241,7 @@ def render_capture(
 
 def _render(request: RenderRequest, out: Path, on_progress: OnProgress) -> None:
     """Render a request that was checked."""
-    refuse_no_capture(out)
-    if out.exists() and not request.overwrite and (out.is_file() or any(out.iterdir())):
-        raise UsageError(
-            "exists already", where=out, remedy="Choose another place, or --overwrite."
-        )
+    refuse_taken(out, overwrite=request.overwrite)
     key = render_key(request.scene, request.frames, request.edge)[:16]
     waiting = out.absolute().parent / f".{out.name}.{key}{'-exr' if request.exr else ''}"
     with exclusive(waiting, wait=True):
