@@ -9,6 +9,7 @@ from __future__ import annotations
 import ast
 import contextlib
 import linecache
+import logging
 import symtable
 import sys
 import types
@@ -86,8 +87,8 @@ def _collect(
     value = getattr(module, name, None)
     if text and value is not None and _is_plain(value):
         text = f"{name} = {value!r}"
-    # What a package is set to belongs to the process, not to the method.
-    elif text and not isinstance(value, types.ModuleType):
+    # What a package or a logger is set to belongs to the process, not to the method.
+    elif text and not isinstance(value, types.ModuleType | logging.Logger):
         for change, node in sources[:place]:
             if name in _changed(node):
                 raise UsageError(

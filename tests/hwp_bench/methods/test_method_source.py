@@ -113,8 +113,9 @@ USES = "class Mine:\n    def __init__(self, settings, seed):\n        self.value
         ("COUNT = 1\nCOUNT += 1\n", "COUNT"),
         ("if True:\n    def helper(x):\n        y = x\n        return y\n", "helper(3)"),
         ("try:\n    class Part:\n        size = 2\nfinally:\n    pass\n", "Part.size"),
-        # A package is set for the process; a new object is not the class.
+        # A package and a logger are set for the process; a new object is not the class.
         ("import math\nmath.floor(2.5)\n", "math.floor(1.5)"),
+        ('import logging\nlog = logging.getLogger("x")\nlog.debug("made")\n', "log.name"),
         ("class Part:\n    size = 2\n    def grow(self): pass\nPart().grow()\n", "Part.size"),
         # What changed it before it was made anew does not count.
         ("part = set()\npart.add(1)\npart = {2, 3}\n", "part"),
