@@ -20,6 +20,8 @@ from wildghand.gaussians.fit_loop import Loss, StepThreads, repeatable, spent
 
 #: Steps over which the loss is averaged before it is judged.
 WINDOW = 50
+#: Steps after the last window whose mean loss is judged at the end of a fit.
+FEWEST = 10
 #: A mean loss of a window beyond this multiple of the best one means divergence.
 MAX_RISE = 3.0
 
@@ -157,10 +159,18 @@ class Watchers:
         return mean <= MAX_RISE * self._best_loss
 
     def sound(self, model: Any) -> bool:
-        """Whether a fit ends well: all is finite since the last window, and a step moved it."""
+        """Whether a fit ends well: since the last window all is finite, and no loss has risen far.
+
+        A few losses without a skipped step may be those of hard frames, and are not judged.
+        """
         losses = _read_losses(self._losses)
-        stuck = self._best is None and 0 < len(losses) == model.skipped()
-        return all(map(math.isfinite, losses)) and not stuck and model.finite()
+        if not (all(map(math.isfinite, losses)) and model.finite()):
+            return False
+        skipped = model.skipped() - self._skipped
+        if self._best is None:
+            return not 0 < len(losses) == skipped
+        judged = skipped > 0 or len(losses) >= FEWEST
+        return not judged or sum(losses) <= MAX_RISE * self._best_loss * len(losses)
 
     def best(self) -> Any:
         """The state with the lowest loss; `DidNotConverge` if there was none."""

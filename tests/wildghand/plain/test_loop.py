@@ -10,7 +10,7 @@ from painted import painted_avatar
 
 from hwp_bench.base.errors import DidNotConverge
 from wildghand.gaussians.fit_loop import repeatable
-from wildghand.plain.loop import MAX_RISE, WINDOW, Watchers
+from wildghand.plain.loop import FEWEST, MAX_RISE, WINDOW, Watchers
 from wildghand.plain.model import PlainModel
 
 
@@ -103,6 +103,26 @@ def test_a_short_fit_that_skipped_every_step_is_not_sound(model: PlainModel) -> 
         guard.watch(step, 1.0, Fitted(model))
     assert guard.sound(Fitted(model, 2))
     assert not guard.sound(Fitted(model, 3))
+
+
+@pytest.mark.parametrize(
+    ("steps", "loss", "skipped", "sound"),
+    [
+        (FEWEST, 1.01 * MAX_RISE, 0, False),
+        (FEWEST, 0.99 * MAX_RISE, 0, True),
+        (FEWEST - 1, 1.01 * MAX_RISE, 0, True),
+        (2, 1.01 * MAX_RISE, 1, False),
+        (2, 0.99 * MAX_RISE, 2, True),
+    ],
+)
+def test_a_loss_that_rose_far_since_the_last_window_is_not_sound(
+    model: PlainModel, steps: int, loss: float, skipped: int, sound: bool
+) -> None:
+    guard = Watchers()
+    watch_window(guard, model, 0, 1.0, skipped=3)
+    for step in range(steps):
+        guard.watch(WINDOW + step, loss, Fitted(model, 3))
+    assert guard.sound(Fitted(model, 3 + skipped)) == sound
 
 
 def test_without_any_good_state_there_is_only_the_error() -> None:
