@@ -6,7 +6,7 @@ import base64
 import functools
 import io
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,6 +18,7 @@ from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.files import write_json
 from hwp_bench.base.images import as_uint8, write_image
 from hwp_bench.base.records import Count, Seconds
+from hwp_bench.capture import Capture
 from hwp_bench.capture.schema import MAX_FRAMES, HandModelId
 from hwp_bench.hands import load_template
 from hwp_bench.methods.contract import Camera, HandPose
@@ -319,6 +320,13 @@ class WildGHandAvatar(HandAvatar):
         """
         poses = self.model.clip_poses
         return dict(hands) if poses is None else poses.corrected(hands)
+
+    def believed_capture(self, capture: Capture) -> Capture:
+        """The capture that was fitted; poses of its hands are replaced by the corrected ones."""
+        poses = self.model.clip_poses
+        if poses is None:
+            return capture
+        return replace(capture, hands=poses.corrected_clip(capture.hands))
 
     def rest_poses(self) -> dict[str, HandPose]:
         """Return every hand at rest; two hands lie side by side."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import re
 import time
 from collections.abc import Mapping, Sequence
@@ -134,10 +133,7 @@ def explain_frames(
     for frame in frames:
         if frame not in fitted:
             raise UsageError(f"{frame} was not fitted", field="frames")
-    posed = capture
-    if model.clip_poses is not None:
-        # What the frames were explained in.
-        posed = dataclasses.replace(capture, hands=model.clip_poses.corrected_clip(capture.hands))
+    posed = avatar.believed_capture(capture)
     clip = TrainingClip(posed, np.array(fitted), model.rigs, torch.device("cpu"))
     info, found = capture.info, []
     for frame in frames:

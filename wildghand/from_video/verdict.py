@@ -100,7 +100,8 @@ def judge_avatar(avatar: WildGHandAvatar, capture: Capture) -> Verdict:
     seen, parts, film = {}, {}, []
     fitted = avatar.record.frames
     looked = np.array(fitted)[evenly(len(fitted), _LOOKED_AT)]
-    clip = TrainingClip(capture, looked, avatar.model.rigs, torch.device("cpu"))
+    posed = avatar.believed_capture(capture)
+    clip = TrainingClip(posed, looked, avatar.model.rigs, torch.device("cpu"))
 
     def visible(rows: torch.Tensor) -> torch.Tensor:
         masks = [capture.mask(int(looked[row])) for row in rows.tolist()]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -10,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from small_captures import free_hand
 from synthetic_clip import FOCAL, HEIGHT, WIDTH, make_clip
 from tiny_fits import UNJUDGED
@@ -17,6 +19,7 @@ from tiny_fits import UNJUDGED
 import wildghand
 from hwp_bench.capture import Cameras, Capture, CaptureInfo, CaptureWriter, open_capture
 from wildghand.from_video.verdict import judge_avatar, parts_of, read_verdict
+from wildghand.poses.believe import ClipPoses
 
 FRAMES, EDGE = 30, 80
 #: A camera on the other side of the hand, which is 0.42 m away.
@@ -93,6 +96,20 @@ def test_frames_that_were_kept_out_are_scored(tmp_path: Path) -> None:
     assert f"{verdict.psnr:.1f} dB on 3 kept out frames" in said
     (tmp_path / "verdict.json").write_text(json.dumps(asdict(verdict)))
     assert read_verdict(tmp_path / "verdict.json") == verdict
+
+
+def test_the_surface_is_counted_in_the_corrected_poses(tmp_path: Path) -> None:
+    """Oracle: hands that are turned by 180 degrees about their fingers show the back."""
+    capture = film(tmp_path / "capture", [False] * FRAMES)
+    avatar = wildghand.fit(capture.root, settings=UNJUDGED, steps=2)
+    pose = capture.hands["right"].pose.copy()
+    over = Rotation.from_rotvec(pose[:, 0]) * Rotation.from_rotvec([np.pi, 0.0, 0.0])
+    pose[:, 0] = over.as_rotvec()
+    turned = {"right": dataclasses.replace(capture.hands["right"], pose=pose)}
+    avatar.model.clip_poses = ClipPoses.of(capture.hands, turned)
+    seen = judge_avatar(avatar, capture).parts_seen["right"]
+    assert seen["palm"] < 0.1, seen
+    assert seen["back"] > 0.8, seen
 
 
 @pytest.mark.parametrize("side", ["right", "left"])
