@@ -83,6 +83,15 @@ class ResultsFolder:
                 _take_place(self.unfinished(place), self.final(place))
         return result
 
+    def as_it_was(self, results: Results) -> Results:
+        """The record that is there, if a new one would only say otherwise when and where it ran."""
+        with contextlib.suppress(HwpError):
+            stored = read_results(self.root / RESULTS)
+            run = {name: getattr(stored, name) for name in ("started", "environment", "toolkit")}
+            if replace(results, **run) == stored:
+                return stored
+        return results
+
 
 def finish_together(finished: Sequence[tuple[ResultsFolder, Results]], *, tables: bool) -> None:
     """Write the records of whole evaluations of one command; old results go only now."""

@@ -27,7 +27,7 @@ from hwp_bench.evaluation.capture_evaluation import EvaluationSettings
 from hwp_bench.evaluation.evaluate import evaluate
 from hwp_bench.evaluation.verify import verify_results
 from hwp_bench.methods.contract import Budget, RunSettings
-from hwp_bench.results import Results
+from hwp_bench.results import Results, read_results, write_results
 from hwp_bench.run.engine import Job
 from hwp_bench.run.engine.job import LocalEngine, OnDone, OnStart
 from hwp_bench.run.sandbox.confinement import Confinement
@@ -138,6 +138,19 @@ def test_results_of_another_method_or_other_data_are_refused(
     with pytest.raises(UsageError, match="the method's files have changed"):
         run(method, captures, out)
     assert tree(out) == before
+
+
+def test_a_call_that_runs_nothing_leaves_the_record_as_it_was(
+    method, captures, tmp_path: Path
+) -> None:
+    # A second call on another day and machine would pass for a second run.
+    out = tmp_path / "out"
+    first = run(method, captures, out)
+    elsewhere = {**first.environment, "processor": "another"}
+    before = replace(first, started="2026-01-01T00:00:00+00:00", environment=elsewhere)
+    write_results(out / "results.json", before)
+    assert run(method, captures, out) == before == read_results(out)
+    assert len(fits(method)) == 2
 
 
 def test_the_same_call_keeps_what_is_there_and_says_so(
