@@ -139,17 +139,18 @@ def robustness_table(sources: Sequence[ResultsSource], base: str | None = None) 
             field="RESULTS",
             remedy="Give the results of `evaluate` and of `evaluate --train-on clean`.",
         )
-    start = _base(perturbed, base)
+    starts = [_base(perturbed, base, run) for run, _ in pairs]
+    start = next(filter(None, starts), None)
     names = common_metrics(runs, ROBUST)
-    columns: list[Filled] = [(Column("Method"), [run.first.method.title for run, _ in pairs])]
+    columns: list[Filled] = [(Column("Method"), labels([run.first for run, _ in pairs]))]
     for name in names:
         label, head = metric_facts(name).label, score_column(name)
-        base_score = macro_mean(start, name) if start else None
+        bases = [macro_mean(start, name) if start else None for start in starts]
         scores = [(macro_mean(run, name), macro_mean(clean, name)) for run, clean in pairs]
         changes = [100 * (score - best) / abs(best) if best else None for score, best in scores]
         closed = [
-            None if run is start else _closed(base_score, *own, higher=bool(head.higher_is_better))
-            for (run, _), own in zip(pairs, scores, strict=True)
+            None if run is own_start else _closed(below, *own, higher=bool(head.higher_is_better))
+            for (run, _), own, own_start, below in zip(pairs, scores, starts, bases, strict=True)
         ]
         perturbed_head = Column("Perturbed", head.digits, head.higher_is_better, label)
         columns += [
@@ -163,7 +164,8 @@ def robustness_table(sources: Sequence[ResultsSource], base: str | None = None) 
         "it can reach. Change: perturbed against clean.",
         "Gap closed: of the way from "
         + (f"{start.first.method.title} on perturbed frames" if start else "a base (--baseline)")
-        + " to that oracle, the share that the method goes. Macro means.",
+        + " to that oracle, the share that the method goes. Of several bases, the one with its "
+        "budget counts. Macro means.",
     )
     return table_of("Robustness", columns, notes)
 
@@ -179,12 +181,16 @@ def _oracle(run: MethodRuns, runs: Sequence[MethodRuns]) -> MethodRuns | None:
     return next((one for one in same if one.first.frames == "clean"), None)
 
 
-def _base(perturbed: Sequence[MethodRuns], name: str | None) -> MethodRuns | None:
+def _base(perturbed: Sequence[MethodRuns], name: str | None, run: MethodRuns) -> MethodRuns | None:
+    """Return the runs of the named method: of several, the one with a method's own budget."""
     if name is None:
         return None
-    for run in perturbed:
-        if run.first.method.name == name:
-            return run
+    named = [one for one in perturbed if one.first.method.name == name]
+    if any(one is run for one in named):
+        return run
+    alike = [one for one in named if one.first.budget == run.first.budget]
+    if named:
+        return next((found[0] for found in (named, alike) if len(found) == 1), None)
     known = ", ".join(sorted({run.first.method.name for run in perturbed}))
     raise UsageError(
         f"no result on perturbed frames is of {name!r}",

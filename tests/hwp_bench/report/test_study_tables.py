@@ -60,6 +60,26 @@ def test_the_gap_is_what_it_is_by_hand(make_results) -> None:
     assert cells(robustness_table(sources))[0]["PSNR Gap closed [%]"] is None
 
 
+def test_the_gap_is_counted_from_the_base_of_the_same_budget(make_results) -> None:
+    def run(name: str, psnr: float, seconds: float, frames: str = "perturbed") -> ResultsSource:
+        budget = {"seconds": seconds, "steps": None}
+        result = replace(make_results(name, psnr), frames=frames, budget=budget)
+        return ResultsSource(result, None)
+
+    mine = [run("mine", 23, 64.0), run("mine", 24, 64.0, "clean")]
+    mine += [run("mine", 21, 16.0), run("mine", 24, 16.0, "clean")]
+    plain = [run("plain", 20, 16.0), run("plain", 22, 64.0)]
+    rows = cells(robustness_table([*plain, *mine], "plain"))
+    # (23 - 22) / (24 - 22) and (21 - 20) / (24 - 20).
+    closed = {row["Method"]: row["PSNR Gap closed [%]"] for row in rows}
+    assert len(closed) == 2
+    assert sorted(closed.values()) == [pytest.approx(25), pytest.approx(50)]
+    # None of the two has the budget of this one.
+    short = [run("mine", 23, 5.0), run("mine", 24, 5.0, "clean")]
+    rows = cells(robustness_table([*plain, *short], "plain"))
+    assert rows[0]["PSNR Gap closed [%]"] is None
+
+
 def test_robustness_needs_both_kinds_of_frames(make_results) -> None:
     sources = [ResultsSource(make_results(), None)]
     with pytest.raises(UsageError, match="perturbed and on clean frames"):
