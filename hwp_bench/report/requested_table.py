@@ -27,6 +27,7 @@ from hwp_bench.report.sources import (
     DataGroup,
     ResultsSource,
     data_groups,
+    data_key,
     find_captures,
     open_captures_of,
     read_sources,
@@ -158,6 +159,13 @@ def _paper(number: int, request: TableRequest) -> Table:
     sources = read_sources(request.paths)
     results = [source.results for source in sources]
     same_data(results)
+    # Table 9 has a row for each capture, and ranks nothing.
+    if number != 9 and len({data_key(one) for one in results}) > 1:
+        raise UsageError(
+            "results on other data, frames or protocols do not stand in one table",
+            field="RESULTS",
+            remedy="Give results on the same captures; `--by paper` shows several data apart.",
+        )
     runs = group_runs(results)
     marks = _marks(request.paths) if number == 6 else None
     if number == 6 and runs and not marks:

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import write_json
 from hwp_bench.base.tables import format_table
 from hwp_bench.report.requested_table import TableRequest, make_table
-from hwp_bench.results import FrameResult, Results, write_results
+from hwp_bench.results import FrameResult, Results, read_results, write_results
 
 GOLDEN = Path(__file__).with_name("golden")
 
@@ -101,6 +102,24 @@ def test_published_rows_are_marked_and_never_ranked(folders) -> None:
     assert all(table.rank(row, 1) is None for row in published)
     assert [table.rank(row, 1) for row in (0, 1)] == [1, 0]
     assert any("cannot be compared" in note for note in table.notes)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda result: replace(result, captures=result.captures[:1]),
+        lambda result: replace(result, frames="clean"),
+        lambda result: replace(result, protocols={"hwp-v0": {}}),
+    ],
+    ids=["captures", "frames", "protocols"],
+)
+def test_results_on_other_data_do_not_stand_in_one_layout(
+    change: Callable[[Results], Results], folders
+) -> None:
+    file = folders[0] / "results.json"
+    write_results(file, change(read_results(file)))
+    with pytest.raises(UsageError, match="on other data, frames or protocols"):
+        make_table(TableRequest(folders, paper=3))
 
 
 def test_what_makes_no_table_is_refused(folders) -> None:
