@@ -59,7 +59,7 @@ from hwp_bench.report.study_tables import (
     severity_table,
     winner_note,
 )
-from hwp_bench.report.tables import all_tables, free_view_table, same_data
+from hwp_bench.report.tables import all_tables, free_view_table, over_seeds, same_data
 from hwp_bench.results import Results
 from hwp_bench.results.schema import add_isolation_note
 from hwp_bench.taxonomy import perturbation
@@ -183,7 +183,7 @@ def gather_report(
     cost = _optional(lambda: analyse_cost(runs, HEADLINE))
     ranking = _optional(lambda: rank_methods(runs, HEADLINE))
     several = any(len(run.seeds) > 1 for run in runs)
-    tables = all_tables(measured)
+    tables = {name: over_seeds(one, measured) for name, one in all_tables(measured).items()}
     shown = [
         tables["overall"],
         _optional(lambda: rank_table(runs, ranking)) if len(runs) > 1 else None,
@@ -192,7 +192,7 @@ def gather_report(
         _optional(lambda: free_view_table(measured)),
         replace(tables["paper"], caption="Protocol paper-wildghand"),
         _optional(lambda: robustness_table(sources, base or plain)),
-        _optional(lambda: severity_table(chosen, infos)),
+        _optional(lambda: over_seeds(severity_table(chosen, infos), measured)),
         _optional(lambda: bias_table(chosen, infos)),
         _optional(lambda: seeds_table(chosen)) if several else None,
     ]

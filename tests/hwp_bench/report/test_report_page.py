@@ -198,6 +198,15 @@ def html_of(table: Table) -> str:
     return str(template.module.show(table))
 
 
+def test_seeds_of_a_method_are_one_row() -> None:
+    found = [made_results("mine", lambda c, f, s: 20.0 + s, seed=seed) for seed in (0, 1, 2)]
+    found.append(made_results("plain", lambda c, f, s: 21.5))
+    tables = gather_report([ResultsSource(one, None) for one in found])["tables"]
+    rows = {table.caption: table.rows for table in tables}
+    assert [row[:2] for row in rows["All captures"]] == [("Mine", 21.0), ("Plain", 21.5)]
+    assert {row[0] for row in rows["Per perturbation"]} == {"Mine", "Plain"}
+
+
 def test_tables_mark_ranks_blocks_and_groups() -> None:
     columns = (Column("A"), Column("B", 1, True, "G"))
     table = Table("C", columns, (("x", 1.0), ("y", 2.0), ("z", None)), breaks=(2,))
