@@ -170,11 +170,14 @@ def _evaluate_several(
         own = replace(settings, run=replace(settings.run, seed=seed))
         calls += [Call(each, own, seed_folder(out, each.name, seed)) for each in manifests]
     done, status = [], 0
+    made: set[str] = set()
     with _running(args, calls, sealed) as (captures, jobs, options):
+        rehearse = options["rehearse"]
         for index, (manifest, own, folder) in enumerate(calls):
             head = f"{manifest.title}, seed {own.run.seed}, "
             notice(f"{head}{index + 1} of {len(calls)}")
-            options["rehearse"] = options["rehearse"] and index < len(manifests)
+            # A method that was made once can be made with every seed.
+            options["rehearse"] = rehearse and manifest.name not in made
             options["on_capture"] = jobs.turn if jobs else None
             try:
                 results = evaluate(str(manifest.root), captures, folder, own, **options)
@@ -183,6 +186,7 @@ def _evaluate_several(
                 notice(f"{head}not evaluated: {error}")
                 status = 1
                 continue
+            made.add(manifest.name)
             status |= _notice_failures(folder, results, head)
             done += [folder] if results.drawn else []
     by = "rank" if len(manifests) > 1 else "seeds"

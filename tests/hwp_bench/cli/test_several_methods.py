@@ -92,6 +92,19 @@ def test_what_fails_is_said_and_the_others_are_compared(
     assert "Toy" in told.out
 
 
+def test_what_cannot_be_made_is_left_out_with_every_seed(
+    words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = Path("bare/method.toml")
+    file.write_text(file.read_text().replace("{python}", "no-such-program"))
+    assert main([*words, "--seeds", "2", "-o", "field"]) == 1
+    assert capsys.readouterr().err.count("not evaluated") == 2
+    assert [str(file.parent) for file in sorted(Path("field").rglob("results.json"))] == [
+        "field/toy/seed-0",
+        "field/toy/seed-1",
+    ]
+
+
 @pytest.mark.parametrize(
     ("more", "problem"),
     [
