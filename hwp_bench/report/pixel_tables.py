@@ -191,6 +191,7 @@ SHARES = (0.05, 0.2, 0.5, 1.0)
 _ANGLE_NAMES = ("below 5°", "5° to 10°", "10° to 20°", "20° to 40°", "above 40°", "never seen")
 _SHARE_NAMES = ("never", "in 5 % or less", "in 5 to 20 %", "in 20 to 50 %", "in more than 50 %")
 _OFF = "off the posed hand"
+_COMMON = "Frames of which one method has no sound prediction are left out for all."
 #: Rows of the table: what is new, and how much.
 CLASSES = (
     *(("Angle to the nearest training normal", name) for name in (*_ANGLE_NAMES, _OFF)),
@@ -201,8 +202,8 @@ CLASSES = (
 def novelty_table(sources: Sequence[ResultsSource], captures: Mapping[str, Capture]) -> Table:
     """Return one row per class of novelty and method: share of the pixels and of the error, PSNR.
 
-    Errors are pooled over the scored pixels of all frames of all captures. Frames without a
-    sound prediction are left out.
+    Errors are pooled over the scored pixels of all frames of all captures. Frames of which one
+    method has no sound prediction are left out for all.
     """
     totals = _pooled(sources, captures)
     if not any(pixels.any() for pixels, _ in totals):
@@ -235,6 +236,7 @@ def novelty_table(sources: Sequence[ResultsSource], captures: Mapping[str, Captu
         "Classes of the scored pixels of all test frames; the squared error is pooled in each.",
         "Angle: between a pixel's normal and the nearest normal of the same 4 mm place in a "
         "training frame. Seen: share of the training frames whose mask shows the place.",
+        _COMMON,
     )
     return table_of("By novelty", columns, notes, breaks=block_breaks(keys))
 
@@ -259,7 +261,8 @@ def _pooled(
                         field="RESULTS",
                     )
                 runs.append((stored_predictions(source, item), total))
-        frames = sorted({frame for files, _ in runs for frame in files})
+        # Of frames that all have: a method must not gain by leaving out what is hard.
+        frames = sorted(set.intersection(*(set(files) for files, _ in runs))) if runs else []
         if not frames:
             continue
         for novelty in measure_novelty(capture, split, frames):
@@ -268,8 +271,6 @@ def _pooled(
             target = capture.frame(novelty.frame) / 255.0
             classes = classes_of(novelty, region)
             for files, (pixels, errors) in runs:
-                if novelty.frame not in files:
-                    continue
                 prediction = read_rgb(files[novelty.frame], capture.size) / 255.0
                 error = squared_error(prediction, target)[region]
                 for index in classes:
@@ -302,14 +303,15 @@ _NOTES = (
     "With the outside: the error of these pixels, which should be black, is added. If spread: the "
     "headline's PSNR if the drawn hand went on outwards in its nearest colours.",
     "A hand behind a sleeve or an object counts as drawn outside, for every method alike.",
+    _COMMON,
 )
 
 
 def outline_table(sources: Sequence[ResultsSource], captures: Mapping[str, Capture]) -> Table:
     """Return one row per method: PSNR, what is drawn outside, and PSNR with it and with more of it.
 
-    Frames without a sound prediction are left out, and captures that are not at hand for every
-    method.
+    Frames of which one method has no sound prediction are left out for all, and captures that are
+    not at hand for every method.
     """
     found = _score_again(sources, captures, "Outlines", outline_scores)
     means = [OutlineScores(*np.mean(scores, axis=0)) for scores in found]
@@ -387,14 +389,15 @@ _SHARP_NOTES = (
     "has what the truth has not. Correlation: 1 where the drawn structure is the truth's. Pooled "
     "over the frames of a capture, then means over captures.",
     "The noise of a camera counts as structure of the truth.",
+    _COMMON,
 )
 
 
 def sharpness_table(sources: Sequence[ResultsSource], captures: Mapping[str, Capture]) -> Table:
     """Return one row per method: how much of the truth's fine structure it draws, band by band.
 
-    Frames without a sound prediction are left out, and captures that are not at hand for every
-    method, or whose truth has nothing in a band.
+    Frames of which one method has no sound prediction are left out for all, and captures that are
+    not at hand for every method, or whose truth has nothing in a band.
     """
     found = _score_again(sources, captures, "Sharpness", band_power)
     # (methods, captures, 3, B)
@@ -455,12 +458,11 @@ def _means(
     if not all(runs):
         return []
     scores: list[list[np.ndarray]] = [[] for _ in sources]
-    # Each frame is read once for all methods.
-    for frame in sorted({frame for files in runs for frame in files}):
+    # Each frame is read once for all methods, and only where all have it: a method must not gain
+    # by leaving out what is hard.
+    for frame in sorted(set.intersection(*map(set, runs))):
         target, (mask, exact) = capture.frame(frame), capture.scoring_mask(frame)
         for files, mine in zip(runs, scores, strict=True):
-            if frame not in files:
-                continue
             prediction = read_rgb(files[frame], capture.size)
             one = score(prediction, target, mask, coverage=exact)
             if one is not None:

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from hwp_bench.base.errors import ShapeMismatch, UsageError
 from hwp_bench.capture import Capture
+from hwp_bench.capture.schema import frame_name
 from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.hands.articulation import axis_angle_to_matrix
 from hwp_bench.metrics.protocol import PSNR_CAP
@@ -371,6 +372,27 @@ def test_who_draws_larger_is_seen(
     assert exact[0] == large[0] == larger[0]
     assert 0.0 < large[1] < larger[1]
     assert exact[2] > large[2] > larger[2]
+
+
+@pytest.mark.parametrize("by", ["outline", "novelty"])
+def test_a_frame_that_one_method_leaves_out_counts_for_none(
+    by: str,
+    make_painted: Callable[..., Capture],
+    make_results: Callable[..., Results],
+    tmp_path: Path,
+) -> None:
+    capture = make_painted()
+    last = contiguous_split(capture.info.id, len(capture)).test.tolist()[-1]
+
+    def dark_at_last(frame: int) -> np.ndarray:
+        return np.asarray(capture.frame(frame) // (4 if frame == last else 1))
+
+    whole = drawn_results(capture, tmp_path / "a", make_results("whole"), dark_at_last)
+    part = drawn_results(capture, tmp_path / "b", make_results("part"), capture.frame)
+    (part / "captures" / capture.info.id / "predictions" / frame_name(last)).unlink()
+    table = make_table(TableRequest([whole, part], by=by, captures=[capture.root]))
+    place = [column.title for column in table.columns].index("PSNR [dB]")
+    assert {row[place] for row in table.rows} == {PSNR_CAP}
 
 
 def test_it_needs_the_captures_and_every_method_s_predictions(
