@@ -21,8 +21,9 @@ from hwp_bench.evaluation.budget.surface import NAME as CEILING
 from hwp_bench.evaluation.budget.surface import TEXT as CEILING_TEXT
 from hwp_bench.evaluation.budget.surface import Ceiling, Pair, error_of, pairs_of
 from hwp_bench.evaluation.capture_evaluation import EvaluationSettings
-from hwp_bench.evaluation.evaluate import How, OnCapture, evaluate
+from hwp_bench.evaluation.evaluate import How, OnCapture, check_call, evaluate
 from hwp_bench.methods.contract import FRAME_CHOICES
+from hwp_bench.methods.manifest import find_method, read_manifest
 from hwp_bench.methods.request import ORACLE_INPUTS, frame_choice, known_oracle_inputs
 from hwp_bench.metrics.pixels import decibels
 from hwp_bench.metrics.protocol import PSNR_CAP
@@ -71,14 +72,22 @@ def run_budget(
         for capture in opened:
             add_subject_mesh(capture)
     variants = plan_variants([known_oracle_inputs(capture) for capture in opened], truths)
-    results, folders = {}, {}
-    for index, (name, replaced) in enumerate(variants.items()):
-        folders[name] = out / "runs" / name.replace(" ", "-")
+    calls = {
+        name: replace(settings, run=replace(settings.run, frames=frame_choice(replaced)))
+        for name, replaced in variants.items()
+    }
+    folders = {name: out / "runs" / name.replace(" ", "-") for name in variants}
+    manifest = read_manifest(find_method(method))
+    for name, call in calls.items():
+        # Before the first fit: what the last variant would be refused for.
+        check_call(manifest, call, folders[name], overwrite=how.get("overwrite", False))
+    results = {}
+    for index, (name, call) in enumerate(calls.items()):
         results[name] = evaluate(
             method,
             captures,
             folders[name],
-            replace(settings, run=replace(settings.run, frames=frame_choice(replaced))),
+            call,
             splits=splits,
             on_capture=on_run(index, len(variants), name) if on_run else None,
             **how,

@@ -150,6 +150,21 @@ def test_wrong_requests_are_refused(dark_capture: Capture, tmp_path: Path) -> No
         run_budget("x", [dark_capture.root], tmp_path, oracle)
 
 
+def test_other_truths_in_the_same_folder_are_refused_before_any_fit(
+    method: Path, dark_capture: Capture, tmp_path: Path, capsys: Any
+) -> None:
+    out = tmp_path / "out"
+    words = ["error-budget", str(method), "--capture", str(dark_capture.root), "-o", str(out)]
+    words += ["--isolation", "none"]
+    assert main([*words, "--truths", "poses", "betas"]) == 0
+    before = sorted((out / "runs").iterdir())
+    capsys.readouterr()
+    # "all of them" would be of other truths.
+    assert main(words) == 2
+    assert "results of another evaluation: frames" in capsys.readouterr().err
+    assert sorted((out / "runs").iterdir()) == before
+
+
 def test_a_real_capture_has_corrections_alone(
     method: Path, make_painted: Callable[..., Capture], tmp_path: Path, capsys: Any
 ) -> None:
