@@ -93,12 +93,11 @@ def _table(args: argparse.Namespace) -> int:
     _print_table(make_table(request), "json" if args.json else args.format)
     if args.figure is not None:
         from hwp_bench.report.clean_share import write_clean_share
-        from hwp_bench.report.sources import find_captures
-        from hwp_bench.results import read_all
+        from hwp_bench.report.sources import find_captures, read_sources
 
-        results = read_all([Path(place) for place in args.results])
+        results = [source.results for source in read_sources(args.results, repeats=False)]
         for path in write_clean_share(args.figure, results, find_captures(results, args.capture)):
-            print(path)
+            notice(f"figure: {path}")
     return 0
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import pytest
@@ -56,6 +57,20 @@ def test_a_method_is_one_curve_over_its_suites(study) -> None:
     assert (found[1].behind.low, found[1].behind.high) in {(None, None), (3.0, 3.0)}
     shown = [(row[0], row[8], row[9]) for row in clean_share_table(results, captures).rows]
     assert shown == [(10, 1, 1), (10, 1, 1), (60, 1, 1), (60, 1, 1)]
+
+
+def test_a_figure_adds_nothing_to_the_table_and_repeats_are_left_out(
+    study, tmp_path, capsys, monkeypatch
+) -> None:
+    results, captures = study
+    for number, result in enumerate([*results, results[0]]):
+        write_results(tmp_path / str(number) / "results.json", result)
+    for module in ("requested_table", "sources"):
+        monkeypatch.setattr(f"hwp_bench.report.{module}.find_captures", lambda *_: captures)
+    words = ["table", *(str(tmp_path / str(number)) for number in range(5)), "--by", "clean-share"]
+    assert main([*words, "--figure", str(tmp_path / "figures"), "--json"]) == 0
+    assert len(json.loads(capsys.readouterr().out)["rows"]) == 4
+    assert (tmp_path / "figures" / "clean-share.png").is_file()
 
 
 def test_only_scores_of_the_same_seeds_are_paired(study) -> None:
