@@ -6,8 +6,8 @@ and prints mean PSNR over the validation frames; without a name all baselines ha
 rows are asked for like this:
 `python -m benchmarks.validation trimmed --captures wild-dev-0 --set patch=false`.
 
-With `--seconds` fits end after so many processor seconds. Each fit leaves a line in
-`tuning.jsonl`, and is not made a second time; `hwp-bench dev docs-results` writes the tables of
+With `--seconds` fits end after so many processor seconds. Each fit of a listed trial leaves a line
+in `tuning.jsonl`, and is not made a second time; `hwp-bench dev docs-results` writes the tables of
 `docs/studies/tuning.md` from it. Test frames are read with `--test` alone, which shows what a
 setting brings: nothing is tuned by it, and nothing is kept.
 """
@@ -160,8 +160,9 @@ def print_table(method: str, arguments: argparse.Namespace) -> None:
         scores = []
         for path in captures:
             given = method, path, settings, budget, arguments.seed
-            if arguments.test:
-                scores.append(score_fit(*given, test=True))
+            # A row of one's own starts from today's preset and is no trial of the study.
+            if arguments.test or arguments.set is not None:
+                scores.append(score_fit(*given, test=arguments.test))
                 continue
             capture = open_capture(path)
             fit = {"method": manifest.name, "digest": manifest.digest, "trial": text}

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from painted import QUICK, SilentReport
 
+from benchmarks import validation
 from benchmarks.validation import kept_score, read_log, read_trials, score_fit, tried_settings
 from hwp_bench.base.errors import BadInput
 from hwp_bench.capture import Capture
@@ -77,3 +80,30 @@ def test_a_fit_is_made_once_and_found_in_the_log(tmp_path: Path) -> None:
     log.write_text(log.read_text() + '{"method":')
     with pytest.raises(BadInput, match=r"log.jsonl.*not JSON"):
         read_log(log)
+
+
+def test_a_row_of_ones_own_is_neither_read_from_the_log_nor_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The trials of plain start from a preset of before; a row of one's own does not.
+    log, rates = tmp_path / "log.jsonl", []
+
+    def score(method: str, path: Path, settings: Any, *rest: Any, test: bool = False) -> float:
+        rates.append(settings["color_rate"])
+        return 20.0
+
+    monkeypatch.setattr(validation, "score_fit", score)
+    monkeypatch.setattr(validation, "ensure_suite", lambda items, **_: [tmp_path] * len(items))
+    capture = SimpleNamespace(info=SimpleNamespace(id="wild-dev-0"), digest="d")
+    monkeypatch.setattr(validation, "open_capture", lambda path: capture)
+    given = {
+        "suite": "wild-dev", "captures": ["wild-dev-0"], "preset": "mini", "steps": 3,
+        "seconds": None, "test": False, "seed": 0, "log": log,
+    }  # fmt: skip
+    validation.print_table("plain", Namespace(set=None, **given))
+    before, kept = rates[0], log.read_bytes()
+    validation.print_table("plain", Namespace(set=["opacity_rate=0.02"], **given))
+    today = read_manifest(find_method("plain")).presets["mini"]["color_rate"]
+    assert rates[-2:] == [today, today]
+    assert before != today
+    assert log.read_bytes() == kept
