@@ -463,6 +463,7 @@ def frame_layers(scene: Scene, result: SimulatedFrame, frame_count: int, size: i
     view = viewmat(scene, seconds)
     lens = Lens(intrinsics(scene, size), view, size, 1, seconds=seconds)
     body = stage.traced(stage.surface(hands))
+    body = replace(body, surface=stage.under_sky(body.surface, stage.seen_sky(body)))
     things = stage.things(objects_at(scene, recipe, seconds), hands)
     image = render_instant(scene, lens, body, things, lights_at(scene, recipe), RenderCost())
     future_hands = hands_at(next_scene, later)

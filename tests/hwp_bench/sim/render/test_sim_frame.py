@@ -10,19 +10,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tiny_scene import BLUR, CLEAN, LIGHT, OBJECT
+from tiny_scene import BLUR, CLEAN, LIGHT, OBJECT, SceneMaker
 
+from hwp_bench.base.colors import srgb_to_linear
 from hwp_bench.base.tables import to_markdown
 from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.sim.effects import SUBFRAME_STEP, plan_frame
 from hwp_bench.sim.produce.capture import true_hands
 from hwp_bench.sim.produce.forecast import forecast, plan_table
 from hwp_bench.sim.props.objects import build_object
-from hwp_bench.sim.render.frame import SimulatedFrame, render_frame
-from hwp_bench.sim.scene.scene import Scene, with_effects
+from hwp_bench.sim.render.frame import SimulatedFrame, frame_layers, render_frame
+from hwp_bench.sim.scene.scene import with_effects
 from hwp_bench.sim.sensor import Sensor
 
-SceneMaker = Callable[..., Scene]
 COUNT, SIZE = 40, 48
 
 
@@ -155,6 +155,18 @@ def test_dimming_is_a_factor_on_linear_light(make_scene: SceneMaker) -> None:
     ratio = dim[bright > 0.1] / bright[bright > 0.1]
     expected = 2.0 ** -result.plan.strength["illumination"]
     np.testing.assert_allclose(np.median(ratio), expected, rtol=0.02)
+
+
+def test_linear_layers_hold_the_light_of_the_frame(make_scene: SceneMaker) -> None:
+    # Oracle: a frame without noise. Under the sky alone much of the shading is occlusion.
+    scene = make_scene()
+    light = replace(scene.light, key=0.0, sky=0.6)
+    scene = replace(scene, sensor=Sensor(noise=0.0), light=light)
+    result = render_frame(scene, CLEAN, COUNT, SIZE)
+    found = frame_layers(scene, result, COUNT, SIZE)[..., :3]
+    hand = result.clean_coverage == 1.0
+    expected = srgb_to_linear(result.clean / 255.0)[hand].mean()
+    assert found[hand].mean() == pytest.approx(expected, rel=0.02)
 
 
 def test_frames_depend_on_the_seed_alone(make_scene: SceneMaker) -> None:
