@@ -149,6 +149,12 @@ def _render(args: argparse.Namespace) -> int:
     if args.suite is not None:
         if any(change is not None for change in changes) or args.exr:
             raise UsageError("a suite is rendered as it is", field="--suite")
+        if args.overwrite:
+            raise UsageError(
+                "captures of a suite that are whole are kept",
+                field="--overwrite",
+                remedy="Remove the folder of the capture, whose name the command prints.",
+            )
         check_places({"--out": args.out}, {})
         with engine_for(args) as engine:
             folders = ensure_suite(
@@ -238,6 +244,9 @@ def _calibrate(args: argparse.Namespace) -> int:
                 measured = " ".join(f"{value:7.3f}" for value in item.measured)
                 target = " ".join(f"{value:7.3f}" for value in item.targets)
                 print(f"{scene.id} {item.kind} ({item.measure}): {measured}  target {target}")
+    if not rows:
+        problem = "none of these scenes has " + (args.effect or "an effect")
+        raise UsageError(problem, field="--effect" if args.effect else "SCENE")
     if args.json:
         print_json(rows)
     return 0

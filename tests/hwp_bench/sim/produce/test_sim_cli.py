@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_scene import SINGLE
+from tiny_scene import SINGLE, SceneMaker
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.cli.main import main
 from hwp_bench.cli.sim import _changed
 from hwp_bench.sim.produce.calibration import TARGETS, Calibration, calibrate, write_strengths
-from hwp_bench.sim.scene.scene import Scene, clean_share
+from hwp_bench.sim.scene.scene import clean_share
 from hwp_bench.sim.scene_files import known_scenes, load_scene, scene_groups, scene_names
-
-SceneMaker = Callable[..., Scene]
 
 
 @pytest.fixture
@@ -82,6 +79,8 @@ def test_render_and_preview(
         ["sim", "render", "capture99", "-o", "x"],
         ["sim", "render", "capture0", "--suite", "mini"],
         ["sim", "render", "--suite", "mini", "--size", "64"],
+        ["sim", "render", "--suite", "smoke", "--overwrite"],
+        ["dev", "calibrate", "wild-dev-7", "--effect", "blur"],
         ["sim", "render", "capture0", "-o", "x", "--severity", "9"],
         ["sim", "preview", "capture0", "--frame-count", "1"],
         # Numbers that no memory holds.
