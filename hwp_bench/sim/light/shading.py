@@ -490,7 +490,7 @@ def lamp_light(
                 lamp.irradiance,
             )
         if lamp.through:
-            total += light_through(samples, lamp, tracers)
+            total += np.reshape(passed, (-1, 1)) * light_through(samples, lamp, tracers)
     return total * lights.exposure
 
 

@@ -5,7 +5,6 @@ A scene that asks for none of them is in `test_sim_sensor` (digest) and `test_si
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -13,13 +12,14 @@ import pytest
 from flat_surface import facing_camera
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tiny_scene import BLUR, CLEAN, LIGHT, OBJECT
+from tiny_scene import BLUR, CLEAN, LIGHT, OBJECT, SceneMaker
 
 from hwp_bench.sim.effects import lights_at, plan_frame
 from hwp_bench.sim.geometry.surface import LIFT, RenderCost, Surface, Tracer, plain
 from hwp_bench.sim.light.lights import (
     BORDER_SHARE,
     FACING_SHARE,
+    CastShadow,
     Lamp,
     Lights,
     Room,
@@ -31,11 +31,9 @@ from hwp_bench.sim.light.lights import (
 )
 from hwp_bench.sim.light.shading import GRIDS, SKIN_REACH, Samples, lamp_light, room_light
 from hwp_bench.sim.render.frame import render_frame
-from hwp_bench.sim.scene.scene import Scene
 from hwp_bench.sim.scene_files import load_scene
 from hwp_bench.sim.sensor import AutoControl, Sensor
 
-SceneMaker = Callable[..., Scene]
 COUNT, SIZE = 40, 48
 FAR_TURN = np.zeros(1, dtype=np.int64)
 
@@ -279,3 +277,8 @@ def test_light_passes_through_thin_skin_and_reddens(thickness: float) -> None:
     assert lamp_light(samples, lights, [double], FAR_TURN).max() == 0.0
     opaque = _dark(lamps=(replace(lamp, through=0.0),))
     assert lamp_light(samples, opaque, [slab], FAR_TURN).max() == 0.0
+    # A shadow takes its share of it.
+    for depth in (0.5, 1.0):
+        cast = CastShadow(np.array([1.0, 0.0, 0.0]), edge=-1.0, width=0.03, depth=depth)
+        shaded = lamp_light(samples, _dark(lamps=(lamp,), cast=cast), [slab], FAR_TURN)[0]
+        np.testing.assert_allclose(shaded, (1.0 - depth) * seen, atol=1e-12)
