@@ -250,6 +250,8 @@ def _render(request: RenderRequest, out: Path, on_progress: OnProgress) -> None:
         except OSError as error:
             raise HwpError(f"cannot be made ({reason_of(error)})", where=waiting) from error
         try:
+            # Another process may have made it while this one waited.
+            refuse_taken(out, overwrite=request.overwrite)
             start = time.perf_counter()
             _render_missing(request, waiting, on_progress)
             _assemble(request, waiting, out, time.perf_counter() - start)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
-from collections.abc import Callable
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from tiny_scene import SceneMaker
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.capture import Capture, open_capture
@@ -21,9 +24,7 @@ from hwp_bench.sim.produce.capture import (
     true_hands,
 )
 from hwp_bench.sim.produce.estimates import EASY_ERROR, estimate_hands
-from hwp_bench.sim.scene.scene import Scene
 
-SceneMaker = Callable[..., Scene]
 FRAMES, SIZE = 20, 40
 
 
@@ -122,6 +123,29 @@ def test_an_interrupted_render_goes_on(
     capture = render_capture(scene, out, frame_count=FRAMES, size=SIZE, workers=1, free_view=False)
     np.testing.assert_array_equal(_pixels(capture), _pixels(open_capture(rendered)))
     assert not waiting.exists()
+
+
+def test_a_capture_that_was_made_while_a_render_waited_is_not_rendered_again(
+    rendered: Path, make_scene: SceneMaker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from hwp_bench.sim.produce import capture as production
+
+    out, honest = tmp_path / "same", production.exclusive
+
+    @contextlib.contextmanager
+    def late(folder: Path, *, wait: bool = False) -> Iterator[None]:
+        with honest(folder, wait=wait):
+            shutil.copytree(rendered, out)
+            yield
+
+    def never(*args: object, **settings: object) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr(production, "exclusive", late)
+    monkeypatch.setattr(production, "render_waiting", never)
+    with pytest.raises(UsageError, match="exists"):
+        render_capture(make_scene(), out, frame_count=FRAMES, size=SIZE, workers=1, free_view=False)
+    assert [path.name for path in tmp_path.iterdir()] == ["same"]
 
 
 def test_refusals(rendered: Path, make_scene: SceneMaker, tmp_path: Path) -> None:
