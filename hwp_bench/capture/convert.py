@@ -132,9 +132,12 @@ FORMATS = (".glb", ".obj", ".ply", ".stl")
 
 
 def hand_meshes(capture: Capture, frame: int, *, truth: bool = False) -> dict[str, trimesh.Trimesh]:
-    """Return the posed meshes of the hands in one frame, by side, in world coordinates, m."""
-    poses = capture.hand_poses(frame)
+    """Return the posed meshes of the hands that one frame shows, by side, in the world, m."""
+    capture.hand_poses(frame)  # Refuses a frame that is not there.
     hands = capture.hands
+    sides = [side for side, hand in hands.items() if hand.valid[frame]]
+    if not sides:
+        raise UsageError(f"shows no hand in frame {frame}", where=capture.root, field="--frame")
     if truth:
         known = capture.true_hands
         if known is None:
@@ -149,7 +152,7 @@ def hand_meshes(capture: Capture, frame: int, *, truth: bool = False) -> dict[st
             pose_parameters(capture.template(side), hands[side], [frame]).vertices[0],
             capture.template(side).faces,
         )
-        for side in poses
+        for side in sides
     }
 
 

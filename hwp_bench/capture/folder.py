@@ -59,7 +59,7 @@ from hwp_bench.capture.schema import (
     write_numbers,
 )
 from hwp_bench.hands.skeleton import Camera, HandParameters, HandPose, hand_poses
-from hwp_bench.hands.sources import load_template
+from hwp_bench.hands.sources import absolute_source, load_template
 
 if TYPE_CHECKING:
     from hwp_bench.hands.template import HandTemplate
@@ -273,7 +273,7 @@ def identify_hand_model(source: str, hands: str) -> HandModelId:
     `source` is the model, as `load_template` takes it; `hands` are `right`, `left` or `both`.
     """
     first = load_template(source, SIDES[hands][0])
-    return HandModelId(first.name, first.digest, source)
+    return HandModelId(first.name, first.digest, absolute_source(source))
 
 
 def load_matching_template(
@@ -481,8 +481,7 @@ def rewrite_capture(
     True hands are left out: they are of the old model.
     """
     with CaptureWriter(out, info, hands, capture.cameras, overwrite=overwrite) as writer:
-        kinds = ["frames", "masks", *["true_masks"] * capture.has_true_masks]
-        kinds += ["clean", "clean_masks"] * capture.has_clean
+        kinds = [kind for kind, name in IMAGE_FOLDERS.items() if (capture.root / name).is_dir()]
         for frame in range(len(capture)):
             for kind in kinds:
                 writer.image(kind, frame, capture.image(kind, frame))

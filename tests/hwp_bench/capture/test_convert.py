@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -22,9 +23,14 @@ from hwp_bench.capture.convert import (
     with_one_shape,
     write_meshes,
 )
-from hwp_bench.capture.folder import load_matching_template, rewrite_capture
+from hwp_bench.capture.folder import (
+    identify_hand_model,
+    load_matching_template,
+    rewrite_capture,
+)
 from hwp_bench.cli.main import main
-from hwp_bench.hands import HandParameters, HandTemplate, pose_hand
+from hwp_bench.hands import HandParameters, HandTemplate, load_template, pose_hand
+from hwp_bench.run.sandbox.confinement import hand_model_files
 
 
 def bent(frames: int = 3) -> HandParameters:
@@ -149,6 +155,37 @@ def test_another_hand_model_is_refused_by_name_and_by_content(
         with pytest.raises(BadInput, match="data convert") as caught:
             load_matching_template(model, sides, "right", where="my_capture")
         assert "my_capture: hand_model" in str(caught.value)
+
+
+def test_the_hand_model_is_found_from_every_folder(
+    mano_folder: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Oracle: a method runs in another folder, and is shown files of absolute paths."""
+    place = Path(mano_folder)
+    monkeypatch.chdir(place.parent)
+    model = identify_hand_model(f"mano:{place.name}", "right")
+    assert identify_hand_model("anny", "right").source == "anny"
+    monkeypatch.chdir(tmp_path)
+    assert load_template(model.source).digest == model.digest
+    assert len(hand_model_files(model.source)) == 2
+
+
+def test_clean_frames_without_masks_are_copied(make_capture: CaptureMaker, tmp_path: Path) -> None:
+    plain = make_capture(frames=10, truth=True)
+    shutil.rmtree(plain.root / "truth" / "clean_masks")
+    rewrite_capture(plain, tmp_path / "out", plain.info, plain.hands)
+    made = open_capture(tmp_path / "out")
+    np.testing.assert_array_equal(made.clean(3), plain.clean(3))
+    assert check_capture(made.root).ok
+
+
+def test_a_hand_that_a_frame_does_not_show_has_no_mesh(make_capture: CaptureMaker) -> None:
+    capture = make_capture(hands="both", frames=10)
+    capture.hands["left"].valid[4] = False
+    assert tuple(hand_meshes(capture, 4)) == ("right",)
+    capture.hands["right"].valid[4] = False
+    with pytest.raises(UsageError, match="shows no hand in frame 4"):
+        hand_meshes(capture, 4)
 
 
 @pytest.mark.parametrize("hands", ["right", "both"])
