@@ -284,6 +284,9 @@ class Cameras:
 
     def __post_init__(self) -> None:
         check_cameras(self.Ks, self.viewmats, where="cameras")
+        for name in ("Ks", "viewmats"):
+            # As they are read: a capture's digest is of values of this type.
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
 
     def __len__(self) -> int:
         return len(self.Ks)

@@ -51,6 +51,21 @@ def test_a_capture_round_trips(make_capture: CaptureMaker, hands: str) -> None:
     assert report.facts["truth"] == ["clean frames", "exact masks", "hand parameters"]
 
 
+@pytest.mark.parametrize("kind", [np.float32, np.int64])
+def test_cameras_of_other_types_are_read_as_written(
+    make_capture: CaptureMaker, tmp_path: Path, kind: type
+) -> None:
+    info = make_capture(frames=10).info
+    K = np.array([[29, 0, 16], [0, 29, 16], [0, 0, 1]], dtype=kind)
+    track = Cameras(np.tile(K, (10, 1, 1)), np.tile(np.eye(4, dtype=kind), (10, 1, 1)))
+    with CaptureWriter(tmp_path / "x", info, {"right": hand_parameters(10)}, track) as writer:
+        for frame in range(10):
+            picture, mask = hand_picture(frame, 32)
+            writer.frame(frame, picture)
+            writer.mask(frame, mask)
+    assert check_capture(tmp_path / "x").ok
+
+
 @pytest.mark.parametrize("hands", ["left", "both"])
 def test_one_frame_has_poses_and_a_camera(make_capture: CaptureMaker, hands: str) -> None:
     capture = make_capture("a", hands=hands, frames=12, size=32, truth=True)
