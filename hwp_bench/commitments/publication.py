@@ -30,6 +30,7 @@ from hwp_bench.base.images import pixel_digest
 from hwp_bench.base.packages import __version__
 from hwp_bench.base.records import Line, Record, parse_record, without_schema
 from hwp_bench.capture import Capture, open_capture
+from hwp_bench.capture.check import refuse_changed
 from hwp_bench.capture.schema import (
     CAMERAS,
     FREE_VIEW,
@@ -42,6 +43,7 @@ from hwp_bench.capture.schema import (
 from hwp_bench.capture.splits import Split, split_for
 from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.request import write_request
+from hwp_bench.metrics.pixels import can_be_scored
 
 #: Version of the commitments.
 SCHEME = "hwp-commitment/1"
@@ -121,6 +123,10 @@ def publish(
         raise UsageError("no capture is given", field="CAPTURES")
     salt = salt or secrets.token_hex(SALT_BYTES)
     pairs = open_captures(captures, splits)
+    for capture, split in pairs:
+        _refuse_unscorable(capture, split.test.tolist())
+        if capture.free_view is not None:
+            _refuse_unscorable(capture.free_view, range(len(capture.free_view)))
     commitments = [commitment(target_content(*pair), salt) for pair in pairs]
     with atomic_folder(out) as root:
         for capture, split in pairs:
@@ -142,6 +148,16 @@ def publish(
     return Publication(
         folder / PUBLIC, folder / SEALED, joint, tuple(capture.info.id for capture, _ in pairs)
     )
+
+
+def _refuse_unscorable(capture: Capture, frames: Iterable[int]) -> None:
+    """Refuse, before the commitment, a capture that no evaluation would take after it."""
+    refuse_changed(capture, ("frames", "masks", *["true_masks"] * capture.has_true_masks))
+    for frame in frames:
+        mask, exact = capture.scoring_mask(frame)
+        if not can_be_scored(mask, coverage=exact):
+            problem = f"the mask of frame {frame} leaves no pixel to score"
+            raise BadCapture(problem, where=capture.root, field="masks")
 
 
 def open_captures(

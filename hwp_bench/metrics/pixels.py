@@ -126,6 +126,11 @@ def scored_pixels(mask: np.ndarray, *, erosion: int, coverage: bool = False) -> 
     return cv2.erode(hand.astype(np.uint8), kernel).astype(bool)
 
 
+def can_be_scored(mask: np.ndarray, *, coverage: bool = False) -> bool:
+    """Whether a mask leaves protocol hwp-v1 a pixel to score; see `scored_pixels`."""
+    return bool(scored_pixels(mask, erosion=HWP_V1.mask_erosion, coverage=coverage).any())
+
+
 def bounding_box(region: np.ndarray) -> Box:
     """The smallest box around the True pixels of `region` (H, W) bool."""
     rows = np.flatnonzero(region.any(axis=1))

@@ -15,7 +15,7 @@ from small_methods import write_submission
 from hwp_bench.base.errors import BadCapture, BadInput, UsageError
 from hwp_bench.base.files import canonical_json
 from hwp_bench.base.images import pixel_digest, read_rgb, write_image
-from hwp_bench.capture import Capture
+from hwp_bench.capture import Capture, CaptureWriter
 from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.cli.main import main
 from hwp_bench.commitments import Publication, open_sealed, publish
@@ -56,6 +56,30 @@ def test_authors_get_no_test_pixel_and_no_truth(
     for capture in captures:
         for digest in (capture.info.digests or {}).values():
             assert digest not in text
+
+
+@pytest.mark.parametrize("frame", [3, 18])
+def test_a_capture_that_was_changed_is_not_published(
+    captures: list[Capture], tmp_path: Path, frame: int
+) -> None:
+    # Its evaluations would be refused, and the commitment would stand.
+    image = captures[1].root / "masks" / f"{frame:06d}.png"
+    write_image(image, np.full((48, 48), 255, dtype=np.uint8))
+    with pytest.raises(BadCapture, match=r"digests\.masks: does not match the content"):
+        publish([captures[1].root], tmp_path / "publication")
+    assert not (tmp_path / "publication").exists()
+
+
+def test_a_test_frame_that_cannot_be_scored_is_not_published(
+    captures: list[Capture], tmp_path: Path
+) -> None:
+    two = captures[1]
+    with CaptureWriter(tmp_path / "empty", two.info, two.hands, two.cameras) as writer:
+        for frame in range(20):
+            writer.frame(frame, two.frame(frame))
+            writer.mask(frame, two.mask(frame) * (frame != 18))
+    with pytest.raises(BadCapture, match="mask of frame 18 leaves no pixel to score"):
+        publish([tmp_path / "empty"], tmp_path / "publication")
 
 
 def test_of_two_publications_at_once_one_is_told_and_no_salt_is_lost(
