@@ -476,7 +476,7 @@ def _import_hand(
     if far.any():
         errors["far_frames"] = records.frames[far].tolist()
         notice(
-            f"warning: the {side} hand is annotated far outside of the image, and counts as not "
+            f"warning: the {side} hand is annotated outside of the image, and counts as not "
             f"seen, in {far.sum()} of {len(far)} frames: {bounded(errors['far_frames'])}."
         )
         valid = valid & ~far
@@ -508,16 +508,17 @@ def _refuse_unseen(valid: np.ndarray, side: str, what: str, root: str | os.PathL
 
 
 def _near_image(points: np.ndarray, records: InterHandRecords) -> np.ndarray:
-    """(F,) bool: whether points (F, P, 3) m, world, are before the camera and near the image.
+    """(F,) bool: whether points (F, P, 3) m, world, are before the camera and in or near the image.
 
-    As in a video, they may leave it by no more than the image's size: the windows of all frames
-    are as large as the largest hand, so that one wrong annotation would make every hand tiny. A
-    point that is NaN does not count.
+    As in a video, one of them lies in it, and none leaves it by more than the image's size: the
+    windows of all frames are as large as the largest hand, so that one wrong annotation would make
+    every hand tiny. A point that is NaN does not count.
     """
     local = (points @ records.viewmat[:3, :3].T + records.viewmat[:3, 3]) @ records.K.T
     pixels, size = local[..., :2] / np.maximum(local[..., 2:], 1e-9), np.array(records.size)
     near = (local[..., 2] > 0) & ((pixels > -size) & (pixels < 2 * size)).all(axis=-1)
-    return np.asarray((near | np.isnan(local[..., 2])).all(axis=1))
+    inside = ((pixels > 0) & (pixels < size)).all(axis=-1).any(axis=1)
+    return np.asarray(inside & (near | np.isnan(local[..., 2])).all(axis=1))
 
 
 def _windows(clips: list[ProjectedHand], options: InterHandImport) -> CropWindows:

@@ -28,6 +28,7 @@ from hwp_bench.capture.schema import FREE_VIEW, MAX_FRAMES, MAX_ID, check_camera
 from hwp_bench.hands import HandParameters, load_template, project
 from hwp_bench.hands.skinning import pose_parameters
 from hwp_bench.importers.shared.frames import CropWindows
+from hwp_bench.metrics.pixels import can_be_scored
 
 #: Version of the calibration files, and their largest size in bytes.
 SCHEMA, MAX_BYTES = "hwp-two-cameras/1", 100_000
@@ -210,7 +211,10 @@ def _pixels(points: torch.Tensor, cameras: Cameras) -> np.ndarray:
 
 
 def _common_frames(first: Capture, second: Capture, offset: int) -> tuple[np.ndarray, np.ndarray]:
-    """Frames of both captures at the same times in which both have every hand, evenly chosen."""
+    """Frames of both captures at the same times in which both have every hand, evenly chosen.
+
+    Those of the second can be scored.
+    """
     at = {time - offset: frame for frame, time in enumerate(_times(second))}
     pairs = [(frame, at[time]) for frame, time in enumerate(_times(first)) if time in at]
     pairs = [
@@ -218,6 +222,7 @@ def _common_frames(first: Capture, second: Capture, offset: int) -> tuple[np.nda
         for one, other in pairs
         if all(hand.valid[one] for hand in first.hands.values())
         and all(hand.valid[other] for hand in second.hands.values())
+        and _can_be_scored(second, other)
     ]
     if not pairs:
         raise UsageError(
@@ -227,6 +232,11 @@ def _common_frames(first: Capture, second: Capture, offset: int) -> tuple[np.nda
         )
     rows, others = np.array(pairs)[evenly(len(pairs), MOST)].T
     return rows, others
+
+
+def _can_be_scored(capture: Capture, frame: int) -> bool:
+    mask, exact = capture.scoring_mask(frame)
+    return can_be_scored(mask, coverage=exact)
 
 
 def _times(capture: Capture) -> list[int]:

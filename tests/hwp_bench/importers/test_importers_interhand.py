@@ -193,9 +193,14 @@ def sound_crop(
 
 @pytest.mark.parametrize(
     ("model", "place"),
-    [("mano", "far off"), ("mano", "in the camera's plane"), ("free", "far off")],
+    [
+        ("mano", "far off"),
+        ("mano", "in the camera's plane"),
+        ("mano", "beside the image"),
+        ("free", "far off"),
+    ],
 )
-def test_a_hand_that_is_annotated_far_outside_is_not_seen_there(
+def test_a_hand_that_is_annotated_outside_is_not_seen_there(
     release: tuple[Path, dict], mano: Path, tmp_path: Path, sound_crop: int,
     capsys: pytest.CaptureFixture[str], model: str, place: str,
 ) -> None:  # fmt: skip
@@ -203,7 +208,8 @@ def test_a_hand_that_is_annotated_far_outside_is_not_seen_there(
     root = copied(release[0], tmp_path)
     options = InterHandImport(size=64, mano=mano if model == "mano" else None)
     rotation, position = camera()
-    move = 3.0 * rotation[0] if place == "far off" else position / 1000.0
+    ways = {"far off": 3.0 * rotation[0], "beside the image": -0.2 * rotation[0]}
+    move = ways.get(place, position / 1000.0)
 
     def spoil(tables: dict) -> None:
         frame = tables["21"]["10"]
@@ -214,7 +220,7 @@ def test_a_hand_that_is_annotated_far_outside_is_not_seen_there(
 
     edit(root, "MANO_NeuralAnnot" if model == "mano" else "joint_3d", spoil)
     facts = import_interhand(root, SEQUENCE, tmp_path / "c", options)
-    said = "the right hand is annotated far outside of the image, and counts as not seen, in 1 of"
+    said = "the right hand is annotated outside of the image, and counts as not seen, in 1 of"
     assert f"{said} 12 frames: 10." in capsys.readouterr().err
     assert facts["errors"]["right"]["far_frames"] == [10]
     assert facts["crop_px"] == pytest.approx(sound_crop, rel=0.1)

@@ -21,8 +21,10 @@ from synthetic_clip import make_clip, template
 from synthetic_mano import write_mirrored_mano
 
 from hwp_bench.base.errors import BadInput, UsageError
+from hwp_bench.base.images import write_image
 from hwp_bench.capture import Cameras, Capture, CaptureInfo, CaptureWriter, open_capture
 from hwp_bench.capture.check import check_capture
+from hwp_bench.capture.schema import image_path
 from hwp_bench.cli.main import main
 from hwp_bench.hands import HandParameters, load_template
 from hwp_bench.hands.skinning import pose_parameters
@@ -121,6 +123,13 @@ def pair(tmp_path: Path) -> Pair:
         return captures[0], captures[1]
 
     return make
+
+
+def test_a_frame_whose_mask_is_empty_is_no_novel_view(pair: Pair) -> None:
+    front, side = pair()
+    write_image(image_path(side.root, "masks", 5), np.zeros((SIZE, SIZE), np.uint8))
+    made = add_second_view(front, side, calibration())
+    assert made.second_frames == [frame for frame in range(COUNT) if frame != 5]
 
 
 @pytest.mark.parametrize(("wrong", "millimetres", "pixels"), [(0.0, 0.01, 0.01), (0.03, 4.0, 0.6)])
