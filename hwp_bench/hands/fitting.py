@@ -185,7 +185,12 @@ class _Fit:
             if self.skin is not None:
                 index, normals, near = self._match(posed)
                 gaps = self._gaps(posed, index, normals).abs()
-                total = torch.where(near, gaps, 0.0).sum(dim=1) / near.sum(dim=1).clamp_min(1)
+                # Where no point is in reach, all points count by their distance to the vertices.
+                nearest = torch.gather(posed.vertices, 1, index[..., None].expand(-1, -1, 3))
+                missed = ~near.any(dim=1, keepdim=True)
+                gaps = torch.where(missed, (self.skin - nearest).norm(dim=-1), gaps)
+                near = near | missed
+                total = torch.where(near, gaps, 0.0).sum(dim=1) / near.sum(dim=1)
                 skin_mm[self.chosen] = 1000.0 * total.numpy()
         pose, transl = start.pose.copy(), start.transl.copy()
         pose[self.chosen], transl[self.chosen] = self.pose.detach(), self.transl.detach()
