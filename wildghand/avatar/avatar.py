@@ -19,7 +19,7 @@ from hwp_bench.base.files import write_json
 from hwp_bench.base.images import as_uint8, write_image
 from hwp_bench.base.records import Count, Seconds
 from hwp_bench.capture import Capture
-from hwp_bench.capture.schema import MAX_FRAMES, HandModelId
+from hwp_bench.capture.schema import MAX_FRAMES, HandModelId, arrays_digest, hand_arrays
 from hwp_bench.hands import load_template
 from hwp_bench.methods.contract import Camera, HandPose
 from wildghand.avatar.studio import REST, Pose, Studio
@@ -320,6 +320,14 @@ class WildGHandAvatar(HandAvatar):
         """
         poses = self.model.clip_poses
         return dict(hands) if poses is None else poses.corrected(hands)
+
+    def is_of(self, capture: Capture) -> bool:
+        """Whether the avatar was fitted to a capture, and to this import of it."""
+        source, frames = self.record.source, self.record.frames
+        given = arrays_digest(hand_arrays(capture.hands))
+        known = source.get("capture") in (None, capture.info.id)
+        known = known and source.get("hands") in (None, given)
+        return known and bool(frames) and max(frames) < len(capture)
 
     def believed_capture(self, capture: Capture) -> Capture:
         """The capture that was fitted; poses of its hands are replaced by the corrected ones."""

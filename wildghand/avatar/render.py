@@ -121,11 +121,10 @@ def explain_frames(
         raise UsageError(
             "was fitted without DPD", field="avatar", remedy="Fit it with dpd.enabled=true."
         )
-    origin = avatar.record.source.get("capture")
-    if origin not in (None, capture.info.id) or not fitted or max(fitted) >= len(capture):
-        raise UsageError(
-            f"was fitted to {str(origin)[:100]!r}, not to {capture.info.id!r}", field="avatar"
-        )
+    if not avatar.is_of(capture):
+        origin = str(avatar.record.source.get("capture"))[:100]
+        problem = f"was fitted to {origin!r}, not to this import of {capture.info.id!r}"
+        raise UsageError(problem, field="avatar")
     rows = torch.arange(len(fitted))
     omegas = largest([hand.temporal(rows).omega for hand in model.biases]).abs()
     if frames is None:

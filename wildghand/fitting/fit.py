@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from hwp_bench.base.arrays import evenly
+from hwp_bench.capture.schema import arrays_digest, hand_arrays
 from hwp_bench.methods.contract import Avatar, Budget, TrainingCapture
 from wildghand.avatar.avatar import FitRecord, WildGHandAvatar
 from wildghand.fitting.data import FitData
@@ -181,6 +182,8 @@ class Fit(IterativeFit[WildGHandAvatar]):
         self.device = device
         self.world = world
         self.components = components
+        # By the hands as they are given, before components correct them.
+        self.given = arrays_digest(hand_arrays(training.hands))
         self.data = FitData(training, device)
         for component in components:
             component.prepare(self)
@@ -383,7 +386,7 @@ class Fit(IterativeFit[WildGHandAvatar]):
         data = self.data
         fields: dict[str, Any] = {
             "frames": data.frames.indices.tolist(),
-            "source": {"capture": data.training.id},
+            "source": {"capture": data.training.id, "hands": self.given},
         }
         for component in self.components:
             for name, value in component.record(self, final=final).items():

@@ -179,11 +179,13 @@ def _check(avatar: WildGHandAvatar, capture: Capture) -> None:
         raise UsageError(
             f"shows the {capture.info.hands} hand alone, the avatar has two", where=capture.root
         )
-    origin, fitted = avatar.record.source.get("capture"), avatar.record.frames
-    if origin not in (None, capture.info.id) or not fitted or max(fitted) >= len(capture):
+    if not avatar.is_of(capture):
+        origin = str(avatar.record.source.get("capture"))[:100]
         raise UsageError(
-            f"is {capture.info.id!r}, the avatar was fitted to {str(origin)[:100]!r}",
+            f"is not the import of {origin!r} that the avatar was fitted to",
             where=capture.root,
+            remedy="Give the capture of its fit. A fit of a video that was stopped has imported "
+            "the video again: end it.",
         )
 
 

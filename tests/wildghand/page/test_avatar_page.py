@@ -435,6 +435,16 @@ def test_frames_are_played_at_the_pace_at_which_they_were_recorded(fitted) -> No
         assert samples.shown[-1] == pytest.approx(1 / 30)
 
 
+def test_another_import_of_the_same_id_is_refused(fitted) -> None:
+    """As a second `wildghand fit VIDEO` leaves it that was stopped in its fit."""
+    avatar, capture = fitted
+    hand = capture.hands["right"]
+    other = {"right": replace(hand, pose=hand.pose[::-1].copy())}
+    again = Capture(capture.root, capture.info, other, capture.cameras)
+    with pytest.raises(UsageError, match="is not the import of"):
+        sample_poses(avatar, again, SMALL)
+
+
 def test_the_command_says_what_it_wrote(fitted, folder: Path, tmp_path: Path, capsys) -> None:
     out = tmp_path / "rest.html"
     given = ["page", str(folder), "-o", str(out), "--json"]
