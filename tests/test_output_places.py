@@ -13,6 +13,7 @@ from hwp_bench.base.files import check_places
 from hwp_bench.cli.main import main
 from hwp_bench.results import write_results
 from wildghand.cli.main import main as wildghand
+from wildghand.from_video.make import fit
 
 #: Commands whose output would mix with another output, an input or a capture; C is a capture, R
 #: and S are results, V a video, L landmarks, M a method, A an avatar, X nothing. Then what is said.
@@ -114,6 +115,19 @@ def test_no_command_writes_where_something_else_is(
     assert "Traceback" not in error
     assert status == 2
     assert listing(here) == before
+
+
+def test_from_python_a_fit_does_not_replace_what_holds_its_capture(
+    make_capture: CaptureMaker, tmp_path: Path
+) -> None:
+    capture = make_capture(folder=tmp_path / "my_hand" / "work").root
+    for out, problem in (
+        (tmp_path / "my_hand", "out: holds the input source"),
+        (capture / "avatar", "out: lies in the input source"),
+    ):
+        with pytest.raises(UsageError, match=problem):
+            fit(capture, out, steps=1, overwrite=True)
+    assert (capture / "capture.json").is_file()
 
 
 def test_places_that_are_fine(make_capture: CaptureMaker, tmp_path: Path) -> None:

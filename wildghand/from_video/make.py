@@ -13,6 +13,7 @@ from typing import Any
 import psutil
 
 from hwp_bench.base.errors import BadInput, UsageError, of_type, place, real_number, whole_number
+from hwp_bench.base.files import check_places
 from hwp_bench.base.folders import exclusive
 from hwp_bench.base.images import check_encoder
 from hwp_bench.capture import Capture, open_capture
@@ -256,6 +257,8 @@ def fit(
     out = None if out is None else place(out, "out")
     landmarks = None if landmarks is None else place(landmarks, "landmarks")
     log = None if tensorboard is None else place(tensorboard, "tensorboard")
+    read = source.root if isinstance(source, Capture) else source
+    check_places({"out": out}, {"source": read, "landmarks": landmarks}, replaces=overwrite)
     of_type(settings, (Mapping, type(None)), "settings", "a table of settings by name")
     of_type(side, (str, type(None)), "side", "a text")
     seconds = None if seconds is None else real_number(seconds, "seconds")
