@@ -30,7 +30,14 @@ from typing import Any, Literal
 from hwp_bench.base.console import StagesView, notice
 from hwp_bench.base.errors import BadCapture, BadInput
 from hwp_bench.base.files import read_json, write_json
-from hwp_bench.base.records import Seconds, merged, parse_record
+from hwp_bench.base.records import (
+    MAX_COUNT,
+    MAX_SECONDS,
+    MAX_SEED,
+    Seconds,
+    merged,
+    parse_record,
+)
 from hwp_bench.capture.schema import METADATA, check_id
 from hwp_bench.importers.shared.output import check_choices
 from hwp_bench.importers.video import SolveSettings, VideoImport
@@ -97,9 +104,17 @@ class VideoFit:
     def __post_init__(self) -> None:
         VideoImport(side=self.side, size=self.size)  # refuses what an import refuses
         check_choices(
-            ("--steps", self.steps is None or self.steps >= 1, "must be 1 or more"),
-            ("--budget", self.seconds is None or self.seconds > 0.0, "must be more than 0"),
-            ("--seed", self.seed >= 0, "must be 0 or more"),
+            (
+                "--steps",
+                self.steps is None or 1 <= self.steps <= MAX_COUNT,
+                f"must be 1 to {MAX_COUNT}",
+            ),
+            (
+                "--budget",
+                self.seconds is None or 0.0 < self.seconds <= MAX_SECONDS,
+                f"must be more than 0, and at most {MAX_SECONDS:g} s",
+            ),
+            ("--seed", 0 <= self.seed <= MAX_SEED, f"must be 0 to {MAX_SEED}"),
             (
                 "--model",
                 self.landmarks is None or self.tracker is None,

@@ -6,6 +6,7 @@ import json
 import zipfile
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -29,6 +30,22 @@ from wildghand.from_video.run import (
 from wildghand.from_video.stages import TrackStage
 
 NAMES = ("one", "two", "three")
+
+
+@pytest.mark.parametrize(
+    ("option", "given"),
+    [
+        ("--budget", {"seconds": float("inf")}),
+        ("--budget", {"seconds": 2e9}),
+        ("--seed", {"seed": 2**63}),
+        ("--steps", {"steps": 2**54}),
+    ],
+)
+def test_what_the_fit_would_refuse_is_refused_before_tracking(
+    option: str, given: dict[str, Any]
+) -> None:
+    with pytest.raises(UsageError, match=option):
+        VideoFit(**given)
 
 
 class _Step(Stage):
