@@ -204,8 +204,9 @@ class TrackStage(Stage):
             raise NoHandSeen(
                 error.problem,
                 where=error.where,
-                remedy="The whole hand must be visible. `hwp-bench data track --min-score "
-                "0.3` accepts less; give what it writes with --landmarks.",
+                remedy="The whole hand must be visible. `hwp-bench data track --min-score 0.3` and "
+                "`hwp-bench data import video --landmarks NPZ --min-score 0.3` accept less; then "
+                "fit the capture.",
             ) from error
 
     def expected(self, job: VideoJob) -> float:
@@ -255,6 +256,8 @@ def import_options(job: VideoJob) -> VideoImport:
     hands = read_sides(job.landmarks, choices.side, min_score=choices.min_score)
     total = len(next(iter(hands.values())).score)
     step = stride(total, job.options.most_frames)
+    taken = len(range(0, total, step))
+    of = f"{total} frames" if step == 1 else f"the {taken} frames that are taken of {total}"
     seen = {side: int(np.count_nonzero(hand.detected[::step])) for side, hand in hands.items()}
     few = [side for side, count in seen.items() if count < FEWEST]
     if few and (len(few) == len(seen) or job.options.side == "both"):
@@ -262,14 +265,14 @@ def import_options(job: VideoJob) -> VideoImport:
         drawn = landmark_sheet(probe(job.video), total, read_hand_tracks(job.landmarks))
         write_image(shown, drawn)
         raise BadInput(
-            f"shows {named} in {seen[few[0]]} of {total} frames, an avatar needs {FEWEST} or more "
+            f"shows {named} in {seen[few[0]]} of {of}, an avatar needs {FEWEST} or more "
             f"({shown} has some of them)",
             where=job.video,
             remedy="Record some seconds in which the whole hand is visible and turns.",
         )
     frames = FrameRange(stride=step)
     if few:
-        notice(f"The {few[0]} hand is in {seen[few[0]]} of {total} frames only and is left out.")
+        notice(f"The {few[0]} hand is in {seen[few[0]]} of {of} only and is left out.")
         return replace(
             choices, frames=frames, side=next(side for side in seen if side not in few) or "auto"
         )
@@ -347,6 +350,8 @@ class Place(Stage):
         return 0.1
 
 
+#: Version of the verdict, which the sheet shows too.
+VERDICT = 2
 #: The stages of a job, in order. Another one is another line here.
 STAGES: tuple[Stage, ...] = (
     TrackStage(),
@@ -360,7 +365,9 @@ STAGES: tuple[Stage, ...] = (
         4.0 + 0.1 * FRAMES,
         draw_turntable,
     ),
-    Picture("verdict", "Judging the avatar", "1", 6.0, write_verdict),
-    Picture("sheet", "Drawing the contact sheet", str((3, COLUMNS, EDGE)), 6.0, draw_sheet),
+    Picture("verdict", "Judging the avatar", str(VERDICT), 6.0, write_verdict),
+    Picture(
+        "sheet", "Drawing the contact sheet", str((3, COLUMNS, EDGE, VERDICT)), 6.0, draw_sheet
+    ),
     Picture("page", "Writing the page", "2", 15.0, write_avatar_page),
 )

@@ -27,15 +27,16 @@ import wildghand
 from hwp_bench.base.errors import BadInput, MissingDependency, UsageError
 from hwp_bench.base.images import read_rgb
 from hwp_bench.capture import open_capture
-from hwp_bench.importers.shared.landmarks import read_hand_tracks, write_hand_tracks
+from hwp_bench.importers.shared.landmarks import read_hand_tracks, read_sides, write_hand_tracks
 from hwp_bench.tracking.networks import HAND, PALM, HandModels, models_folder
+from hwp_bench.tracking.track_video import NoHandSeen
 from wildghand.avatar.files import CALL, load_avatar
 from wildghand.cli.main import main
 from wildghand.from_video import VideoFit, make, make_avatar, stages
 from wildghand.from_video.run import QUICK as QUICK_CHANGES
 from wildghand.from_video.run import QUICK_FRAMES, VideoJob, stride, with_quick
 from wildghand.from_video.run import VIDEO as VIDEO_CHANGES
-from wildghand.from_video.stages import STAGES, Place, import_options
+from wildghand.from_video.stages import STAGES, Place, TrackStage, import_options
 from wildghand.model.settings import read_settings
 
 pytestmark = pytest.mark.slow
@@ -369,6 +370,50 @@ def test_too_few_frames_with_a_hand(folder: Path) -> None:
     assert shown.is_file()
 
 
+def test_frames_with_a_hand_are_counted_among_those_that_are_taken(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("wildghand.from_video.run.FRAMES", 4)  # every fourth of 16
+    score = np.where(np.arange(COUNT) < 8, 0.9, 0.0)
+    write_landmarks(folder / "hand.npz", make_clip(COUNT).landmarks, score=score)
+    with pytest.raises(BadInput, match="in 2 of the 4 frames that are taken of 16"):
+        make_avatar(folder / "hand.avi", folder / "other", choices(folder))
+
+
+def test_what_is_advised_for_faint_hands_takes_them(
+    folder: Path, capsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Oracle: the landmarks that `data track --min-score 0.3` would write."""
+
+    def unseen(*args: Any, **more: Any) -> None:
+        raise NoHandSeen("none", where="v")
+
+    monkeypatch.setattr(stages, "track_video", unseen)
+    job = VideoJob(folder / "hand.avi", folder / "other", choices(folder, landmarks=None))
+    with pytest.raises(NoHandSeen) as caught:
+        TrackStage().run(job)
+    advice = "hwp-bench data import video --landmarks NPZ --min-score 0.3"
+    assert advice in str(caught.value)
+    score = np.full(COUNT, 0.4)
+    write_landmarks(folder / "faint.npz", make_clip(COUNT).landmarks, score=score)
+    given = choices(folder, landmarks=folder / "faint.npz")
+    with pytest.raises(BadInput, match=r"score of at least 0\.5"):
+        import_options(VideoJob(folder / "hand.avi", folder / "other", given))
+    hands = read_sides(folder / "faint.npz", "auto", min_score=0.3)
+    assert all(hand.detected.all() for hand in hands.values())
+
+
+def test_a_verdict_of_another_version_is_made_again_with_its_sheet(folder: Path) -> None:
+    record = folder / "my_hand" / "work" / "stages.json"
+    content = json.loads(record.read_text())
+    for name in ("verdict", "sheet"):
+        facts = content["stages"][name]["facts"]
+        facts[f"look of the {name}"] = facts[f"look of the {name}"].replace("2", "1")
+    record.write_text(json.dumps(content))
+    result = make_avatar(folder / "hand.avi", folder / "my_hand", choices(folder))
+    assert [name for name in NAMES if name not in result.kept] == ["verdict", "sheet"]
+
+
 def test_a_video_of_no_use_is_refused_before_its_import(folder: Path, capsys) -> None:
     """The command says so in one line, and names the sheet."""
     clip = make_clip(COUNT)
@@ -431,7 +476,7 @@ def test_a_video_without_a_hand(tmp_path: Path, capsys) -> None:
     told = capsys.readouterr().err
     assert "none of 3 frames shows a hand" in told
     assert (tmp_path / "wall_avatar" / "work" / "tracked.jpg").is_file()
-    assert "--landmarks" in told
+    assert "--min-score 0.3" in told
 
 
 def test_a_real_hand(tmp_path: Path) -> None:
