@@ -14,8 +14,8 @@ import numpy as np
 
 from hwp_bench.base.console import notice, progress
 from hwp_bench.base.errors import BadInput, UsageError, bounded
-from hwp_bench.base.files import atomic_write, sha256_file, sha256_json
-from hwp_bench.base.images import is_blank, write_image
+from hwp_bench.base.files import sha256_file, sha256_json
+from hwp_bench.base.images import is_blank, read_rgb, write_image
 from hwp_bench.capture.folder import refuse_taken
 from hwp_bench.capture.schema import EXTRA, Cameras, check_id
 from hwp_bench.hands import HandParameters, load_template
@@ -246,7 +246,8 @@ def read_finished_import(
     if not facts or facts.pop("call", None) != _call(video, landmarks, out, options):
         return None
     if options.sheet is not None and not options.sheet.exists():
-        atomic_write(options.sheet, (Path(out) / EXTRA / SHEET_NAME).read_bytes())
+        _check_sheet(options.sheet)
+        write_image(options.sheet, read_rgb(Path(out) / EXTRA / SHEET_NAME))
     return facts
 
 
@@ -415,9 +416,11 @@ def _check_output(out: Path, options: VideoImport) -> None:
     """Check the output before minutes of work, not after them."""
     refuse_taken(out, overwrite=options.overwrite)
     check_id(options.capture_id(out), os.fspath(out))
-    sheet = options.sheet
-    if sheet is None:
-        return
+    if options.sheet is not None:
+        _check_sheet(options.sheet)
+
+
+def _check_sheet(sheet: Path) -> None:
     if sheet.suffix.lower() not in SHEET_KINDS:
         kinds = ", ".join(SHEET_KINDS)
         raise UsageError(f"must end in one of {kinds}", where=sheet, field="--sheet")

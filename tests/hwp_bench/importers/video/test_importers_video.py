@@ -206,6 +206,13 @@ def test_the_command_prints_the_numbers_and_saves_the_sheet(
     assert main(words) == 0
     assert "is complete: the same call has made it" in capsys.readouterr().err
     assert read_rgb(sheet).shape[0] > 96
+    # A sheet of another name is of the kind that the name says.
+    for name, status in (("late.jpg", 0), ("late.gif", 2)):
+        words[words.index("--sheet") + 1] = str(folder / name)
+        assert main(words) == status
+    assert (folder / "late.jpg").read_bytes()[:3] == b"\xff\xd8\xff"
+    assert not (folder / "late.gif").exists()
+    words[words.index("--sheet") + 1] = str(sheet)
     assert main([*words, "--min-score", "0.4"]) == 2
     assert "exists already" in capsys.readouterr().err
     monkeypatch.setattr(SolveSettings, "__init__", lambda self: _set(self, HASTY))
