@@ -193,6 +193,8 @@ def _fit_in(
         f"Fitting {capture.info.id}",
         save=save,
         is_main=world.is_main,
+        # Within a block each process holds its own part of the gradient that they share.
+        every=fit.shared_steps if world.size > 1 else 1,
         begin=fit.require_same,
         look=look,
     )
@@ -213,10 +215,14 @@ def run_resumed(
     *,
     save: bool = True,
     is_main: bool = True,
+    every: int = 1,
     begin: Callable[[int], None] = lambda start: None,
     look: Callable[[int, Loss], None] = lambda step, loss: None,
 ) -> Result:
-    """Run a fit from its saved state, if there is one, and save it every 20 seconds."""
+    """Run a fit from its saved state, if there is one, and save it every 20 seconds.
+
+    It is saved after multiples of `every` steps only.
+    """
     watchers, start, before = Watchers(), 0, 0.0
     if state.is_file():
         start, before = load_state(state, fit, watchers, digest)
@@ -232,7 +238,8 @@ def run_resumed(
 
         def after_step(step: int, watched: Watchers, loss: Loss) -> None:
             nonlocal saved
-            if save and is_main and time.perf_counter() - saved >= SAVE_EVERY:
+            due = step % every == 0 and time.perf_counter() - saved >= SAVE_EVERY
+            if save and is_main and due:
                 save_state(state, fit, watched, step=step, seconds=clock.elapsed, digest=digest)
                 saved = time.perf_counter()
             with clock.standing_still():

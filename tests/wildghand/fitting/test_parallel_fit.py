@@ -17,21 +17,21 @@ from typing import Any
 
 import pytest
 import torch
-from painted import FRAMES, SilentReport
+from painted import FRAMES, SilentReport, TrainingMaker
 from tiny_fits import TINY, UNJUDGED
 
 from hwp_bench.base.errors import HwpError, MissingDependency, UsageError
 from hwp_bench.capture import Capture
 from hwp_bench.capture.splits import contiguous_split
-from hwp_bench.methods.contract import Budget, RunSettings, TrainingCapture
+from hwp_bench.methods.contract import Budget, RunSettings
 from hwp_bench.methods.request import open_request, write_request
 from wildghand.avatar.files import load_avatar
-from wildghand.fitting import parallel
+from wildghand.fitting import parallel, session
 from wildghand.fitting.components import make_fit
 from wildghand.fitting.fit import Component
 from wildghand.fitting.method import WildGHandMethod
 from wildghand.fitting.parallel import SINGLE_PROCESS, World, average_gradients, join, run_in_world
-from wildghand.fitting.session import load_state, save_state
+from wildghand.fitting.session import load_state, run_resumed, save_state
 from wildghand.model.settings import read_settings
 from wildghand.plain.loop import Watchers, run_fit
 
@@ -43,7 +43,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
     # Three frames in ten keep no biases: processes must draw the same chances.
     "paper": {"mode": "paper", "schedule.epochs": 0},
 }
-TrainingMaker = Callable[..., TrainingCapture]
+#: Steps that share the gradient of the texture by fours.
+BLOCKS = {**UNJUDGED, "schedule.steps": 8, "schedule.texture_every": 4}
 State = dict[str, torch.Tensor]
 CPU = torch.device("cpu")
 
@@ -72,6 +73,30 @@ def resumed(request: Path, world: World, state: Path) -> State:
     start, _ = load_state(state, rest, watchers, "d")
     rest.require_same(start)
     return run_fit(rest, Budget(), SilentReport(), start=start, watchers=watchers).model.snapshot()
+
+
+class Stopped(Exception):
+    """Raised in the middle of a fit."""
+
+
+def interrupted(request: Path, world: World, state: Path) -> State:
+    """Stopped within a block of steps that share a gradient, and continued."""
+    session.SAVE_EVERY = 0.0
+
+    def stop(step: int, loss: object) -> None:
+        if step == 6:
+            raise Stopped
+
+    def run(look: Any) -> Any:
+        fit = make_fit(open_request(request), read_settings({**SHORT, **BLOCKS}), 0, CPU, world)
+        every, is_main = fit.shared_steps, world.is_main
+        given = fit, Budget(), state, "d", ""
+        return run_resumed(*given, is_main=is_main, every=every, look=look)
+
+    with contextlib.suppress(Stopped):
+        run(stop)
+    world.wait_for_main()
+    return run(lambda step, loss: None).model.snapshot()
 
 
 class NanLoss(Component):
@@ -121,6 +146,8 @@ def process(rank: int, ports: tuple[int, int], folder: Path) -> None:
         found = {name: fitted(request, changes, world)[1] for name, changes in VARIANTS.items()}
         found["again"] = fitted(request, VARIANTS["unjudged"], world)[1]
         found["resumed"] = resumed(request, world, folder / "state")
+        found["blocks"] = fitted(request, BLOCKS, world)[1]
+        found["interrupted"] = interrupted(request, world, folder / "blocks")
         check_spoiled(request, world)
         with pytest.raises(HwpError, match="process 1 of 2 starts from another state"):
             world.require_same(f"{rank:064x}")
@@ -189,6 +216,8 @@ def test_processes_agree_repeat_and_go_on_bit_for_bit(folder: Path) -> None:
         assert all(torch.equal(value, second[name][key]) for key, value in state.items()), name
     for name in ("again", "resumed"):
         assert all(torch.equal(v, first[name][key]) for key, v in first["unjudged"].items()), name
+    blocks, again = first["blocks"], first["interrupted"]
+    assert all(torch.equal(value, again[key]) for key, value in blocks.items())
 
 
 def torchrun(arguments: list[str]) -> subprocess.CompletedProcess[str]:
