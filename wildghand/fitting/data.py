@@ -61,6 +61,7 @@ class FitData:
         templates: by side, of the hand model.
         subject: how the person's hand differs from them; None: not at all.
         judgement: of the frames.
+        exact_poses: whether the fitted frames have the poses that were given.
     """
 
     def __init__(self, training: TrainingCapture, device: torch.device) -> None:
@@ -68,6 +69,7 @@ class FitData:
         self.device = device
         self.templates = {side: training.template(side) for side in training.sides}
         self.subject: SubjectShape | None = None
+        self.exact_poses = True
 
     @functools.cached_property
     def frames(self) -> TrainingFrames:

@@ -35,7 +35,7 @@ class Reconstruction(Component):
         """Weighted L1 and D-SSIM, the perceptual distance, and the silhouette."""
         settings, image = fit.settings.terms, drawing.image
         weights = settings.fixed
-        dssim = settings.dssim_share(exact_poses=fit.model.clip_poses is None)
+        dssim = settings.dssim_share(exact_poses=fit.data.exact_poses)
         yield weights.reconstruction * terms.reconstruction(
             image, target.image, target.weights, dssim
         )
@@ -65,7 +65,7 @@ class Regularisers(Component):
         """Biases, shadows, opacities, discs on the skin, and roughness of scales and colours."""
         settings, model = fit.settings.terms, fit.model
         weights, flatness = settings.fixed, 0.0
-        if model.clip_poses is not None:
+        if not fit.data.exact_poses:
             flatness = terms.SURFACE_INEXACT
         for side, hand in drawing.hands.items():
             raw = hand.prediction.raw

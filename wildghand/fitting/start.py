@@ -33,6 +33,12 @@ class Poses(Component):
         self.remembered = ClipPoses.of(training.hands, believed)
         if self.remembered is not None:
             fit.data.training = training.with_hands(believed)
+            fit.data.exact_poses = all(
+                np.array_equal(getattr(hand, name)[training.train], given[training.train])
+                for side, hand in believed.items()
+                for name, given in vars(training.hands[side]).items()
+                if name in ("pose", "transl")
+            )
 
     def before(self, fit: Fit) -> None:
         """Let the model keep the corrected poses."""

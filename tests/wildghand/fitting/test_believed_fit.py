@@ -9,12 +9,13 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pygltflib
 import pytest
 import torch
-from painted import SilentReport
+from painted import SilentReport, TrainingMaker
 from tiny_fits import QUICK, UNJUDGED
 
 from hwp_bench.capture import Capture
@@ -32,8 +33,6 @@ from wildghand.model.settings import read_settings
 from wildghand.page.write import PageSettings, sample_poses
 from wildghand.poses import ClipPoses
 from wildghand.viewer.posed_view import Motion
-
-TrainingMaker = Callable[..., TrainingCapture]
 
 
 def _bent(hands: dict[str, HandParameters]) -> dict[str, HandParameters]:
@@ -109,6 +108,29 @@ def test_a_fit_says_in_which_frames_an_error_budget_gives_true_poses(
     make_fit(training, read_settings(UNJUDGED), 0, torch.device("cpu"))
     others = [*training.validation, *training.targets]
     assert [*told[0]] == [*(training.split.train if name == "poses" else others)]
+
+
+def test_the_loss_goes_by_the_poses_of_the_fitted_frames(
+    make_training: TrainingMaker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in an error budget that gives the true poses of the training frames alone."""
+    training = make_training("right")
+    rows, shares, honest = training.train, [], terms.reconstruction
+
+    def bend(templates: object, hands: dict[str, HandParameters], *_: object) -> object:
+        bent = _bent(hands)
+        for side, hand in bent.items():
+            hand.pose[rows], hand.transl[rows] = hands[side].pose[rows], hands[side].transl[rows]
+        return bent
+
+    def watched(*given: Any) -> torch.Tensor:
+        shares.append(given[3])
+        return honest(*given)
+
+    monkeypatch.setattr(start, "believed_hands", bend)
+    monkeypatch.setattr(terms, "reconstruction", watched)
+    assert _fitted(training).model.clip_poses is not None
+    assert set(shares) == {0.2}
 
 
 def test_clips_that_tell_nothing_are_fitted_as_they_are_given(make_training: TrainingMaker) -> None:
