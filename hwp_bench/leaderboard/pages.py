@@ -515,9 +515,9 @@ def _without_source(text: str, studies: Path) -> Iterator[tuple[int, str]]:
     line = 1
     for paragraph in re.split(r"(\n\s*\n)", text):
         linked = [studies / name for name in _STUDY.findall(paragraph)]
-        known = " ".join(file.read_text("utf-8") for file in linked if file.is_file())
+        known = " ".join(" ".join(f.read_text("utf-8") for f in linked if f.is_file()).split())
         for found in _DECIBELS.finditer(paragraph):
             number = " ".join(found[0].split())
-            if number not in " ".join(known.split()):
+            if not re.search(rf"(?<![\d.]){re.escape(number)}", known):
                 yield line + paragraph[: found.start()].count("\n"), number
         line += paragraph.count("\n")

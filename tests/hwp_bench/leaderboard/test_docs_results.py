@@ -259,6 +259,8 @@ def test_a_number_that_was_changed_by_hand_is_found(
         ("It brings 2.5 dB.", ["2.5 dB"]),
         ("It brings 2.5 dB ([study](studies/one.md)).", []),
         ("It brings 2.6 dB ([study](studies/one.md)).", ["2.6 dB"]),
+        # The end of the study's number.
+        ("It brings 5 dB ([study](studies/one.md)).", ["5 dB"]),
         ("See [this](studies/one.md).\n\nIt brings 2.5 dB.", ["2.5 dB"]),
         ("From -1.5 to +2\ndB, and 3 and 4 dB.", ["-1.5 to +2 dB", "3 and 4 dB"]),
         ("At most 100 dB.", []),
