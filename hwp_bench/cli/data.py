@@ -174,7 +174,6 @@ def _print_audit(report: AuditReport) -> None:
     perturbed = ", ".join(f"{frame} ({name})" for frame, name in report.perturbed_test[:10])
     rows = (
         ("frames", ", ".join(f"{part} {count}" for part, count in report.counts.items())),
-        ("in more than one part", str(list(report.overlap)) if report.overlap else "none"),
         ("in no part (guard gap)", str(len(report.left_out))),
         ("perturbed test frames", perturbed or "none known"),
         ("severity unknown for", ", ".join(report.unknown_severity) or "none"),
