@@ -40,7 +40,7 @@ FRAMES = 16
 FROM, FULL = 0.3, 0.5
 # Corrections of the map one after the other, and the share of the difference that each takes.
 _ROUNDS, _SHARE = 3, 0.8
-# Views that the network's colour is worth.
+# Views with which a Gaussian has half of its weight among those of a texel.
 _VIEWS = 0.5
 # Weight of a cell of the map below which it keeps what it has.
 _CELL = 0.02

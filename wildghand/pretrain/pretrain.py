@@ -42,8 +42,8 @@ from wildghand.splat.threads import denormals_flushed
 # Children of a network that belong to its subject.
 _OWN = ("identity", "charts")
 # Between two steps on a capture others move the texture branch, which they share. The last steps
-# are thousands, at low rates: nothing is gained by their mean. All frames are fitted, so that none
-# is there to choose a state.
+# are thousands, at low rates: nothing is gained by their mean. All frames but two are fitted, so
+# that none is there to choose a state.
 _SCHEDULE: Mapping[str, Any] = {"texture_every": 1, "average_share": 0.0, "validated": False}
 
 
