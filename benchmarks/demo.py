@@ -16,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 #: Seconds until the tables, with nothing in the cache.
@@ -46,12 +46,6 @@ def race() -> dict[str, tuple[float, float]]:
         shutil.rmtree(cache / "sim", ignore_errors=True)
         found["warm"] = spent([*_DEMO, str(Path(name) / "second")], cache)
     return found
-
-
-def measure() -> Mapping[str, float]:
-    """Return the processor time of the demo with warm machine code over the reference's."""
-    found = race()
-    return {"warm demo / import and product": found["warm"][1] / found["reference"][1]}
 
 
 def main() -> int:

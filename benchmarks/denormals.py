@@ -82,24 +82,11 @@ def ratios(spent: Mapping[tuple[str, bool], float]) -> dict[str, float]:
     }
 
 
-def measure(
-    capture: str | Path | None = None,
-    *,
-    gaussians: int = 2_000,
-    threads: int = 1,
-    rounds: int = 6,
-) -> Mapping[str, float]:
-    """Ratios by name, lower is better: what denormal gradients cost.
-
-    Args:
-        capture: its folder; None: a small one of 176 px.
-        gaussians: of the fit.
-        threads: of torch.
-        rounds: turns of each fit.
-    """
+def measure() -> Mapping[str, float]:
+    """Ratios by name, lower is better: what denormal gradients cost."""
     before = torch.get_num_threads()
     try:
-        return ratios(processor_ms(capture, gaussians, threads, rounds))
+        return ratios(processor_ms(None, 2_000, 1, 6))
     finally:
         torch.set_num_threads(before)
 

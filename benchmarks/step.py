@@ -214,31 +214,25 @@ def steps_table(steps: Steps) -> Table:
 
 
 def measure(
-    capture: str | Path | None = None,
     *,
-    gaussians: int = GAUSSIANS,
     batches: Sequence[int] = (1, 4),
     threads: Sequence[int] = (1, 2),
     rounds: int = ROUNDS,
-    settings: Mapping[str, Any] | None = None,
     busy: bool = False,
 ) -> Mapping[str, float]:
     """Ratios of whole steps by name, lower is better: to the plain baseline, to one frame in a
     step, to one thread; or those beside busy processes.
 
     Args:
-        capture: its folder; None: a small one of 176 px.
-        gaussians: of both methods.
         batches: sizes of the batch.
         threads: numbers of threads.
         rounds: turns of each fit.
-        settings: further settings of WildGHand.
         busy: measure `beside_busy`, and only that.
     """
     before = torch.get_num_threads()
     try:
-        with opened_request(small_capture(capture)) as training:
-            workload = Workload(training, gaussians, settings)
+        with opened_request(small_capture(None)) as training:
+            workload = Workload(training, GAUSSIANS, None)
             if busy:
                 return beside_busy(workload, rounds)
             return whole_steps(workload, batches, threads, rounds)[1]

@@ -86,7 +86,7 @@ class WildGHandLoop:
         self._threads = threads or StepThreads()
         self._taken = 0
         # Steps may share work, which one of them does: a block has each of them equally often.
-        shared: int = getattr(chosen.schedule, "texture_every", 1)
+        shared: int = chosen.schedule.texture_every
         self._block = -(-BLOCK // shared) * shared
 
     def block(self, blocks: int = 1, *, flush: bool = True) -> list[Spent]:
