@@ -1,4 +1,4 @@
-"""The hard cases of scoring, the optimizer, the pre-pass and shadows hold; each can fail.
+"""The hard cases of every group but the splats hold, and can fail.
 
 Oracles and tolerances: the line of each case.
 """
@@ -15,6 +15,8 @@ import torch
 from hwp_bench.stability import Case, CaseGroup, Context, find_cases
 
 PROVIDERS = {
+    "hands": "hwp_bench.hands.hard_cases",
+    "method": "wildghand.fitting.hard_cases",
     "metrics": "hwp_bench.metrics.hard_cases",
     "optimizer": "wildghand.gaussians.hard_cases",
     "prepass": "wildghand.prepass.hard_cases",
