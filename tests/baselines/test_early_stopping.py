@@ -8,14 +8,13 @@ and the rule written out.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from painted import SilentReport
+from painted import SilentReport, TrainingMaker
 from scipy.ndimage import binary_erosion
 
 from hwp_bench.capture.splits import Split
@@ -27,7 +26,6 @@ from wildghand.model.settings import read_settings
 from wildghand.plain.loop import run_fit
 from wildghand.plain.recipe import FitInputs, PlainRecipe, Recipe, RecipeMethod
 
-TrainingMaker = Callable[..., TrainingCapture]
 CPU = torch.device("cpu")
 BASELINES = Path(__file__).resolve().parents[2] / "baselines"
 MANIFESTS = [read_manifest(file.parent) for file in sorted(BASELINES.glob("*/method.toml"))]

@@ -18,7 +18,7 @@ import pytest
 from flat_surface import facing_camera
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tiny_scene import BLUR, CLEAN, LIGHT, OBJECT
+from tiny_scene import BLUR, CLEAN, LIGHT, OBJECT, SceneMaker
 
 from hwp_bench.base.errors import BadInput, HwpError
 from hwp_bench.capture import open_capture
@@ -34,7 +34,6 @@ from hwp_bench.sim.scene.scene import Scene
 from hwp_bench.sim.sensor import Sensor, through_h264
 from hwp_bench.taxonomy import PERTURBATIONS
 
-SceneMaker = Callable[..., Scene]
 COUNT, SIZE = 40, 48
 #: Digest of the small scene before the sensor had more settings than its noise.
 DIGEST = "ee8a751a9f4870a6aded2d11687819084a758e7963a86bb00fed96149a2e1c4e"

@@ -2,6 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+from hwp_bench.sim.scene.scene import Scene
+
+#: Makes the scene below, with some texts replaced.
+SceneMaker = Callable[..., Scene]
+
 SINGLE = """
 id = "tiny"
 title = "A small scene"

@@ -6,7 +6,6 @@ fit that takes every step by hand; a checkpoint against the avatar of a fit that
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,10 +14,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from odd_fits import part
-from painted import SilentReport
+from painted import SilentReport, TrainingMaker
 from tiny_fits import QUICK
 
-from hwp_bench.methods.contract import Avatar, Budget, TrainingCapture
+from hwp_bench.methods.contract import Avatar, Budget
 from wildghand.fitting.choice import AveragedSteps
 from wildghand.fitting.components import make_fit
 from wildghand.gaussians.fit_loop import batches, repeatable
@@ -27,7 +26,6 @@ from wildghand.plain.choice import AveragedAvatar, Averaging
 from wildghand.plain.loop import run_fit
 
 FIT: dict[str, Any] = {**QUICK, "schedule.steps": 24}
-TrainingMaker = Callable[..., TrainingCapture]
 CPU = torch.device("cpu")
 
 

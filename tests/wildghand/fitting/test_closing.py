@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from painted import TrainingMaker
 
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.fitting import fit as fitting
@@ -15,8 +15,6 @@ from wildghand.fitting import light as closing
 from wildghand.fitting.components import make_fit
 from wildghand.fitting.fit import Fit
 from wildghand.model.settings import read_settings
-
-TrainingMaker = Callable[..., TrainingCapture]
 
 
 def begun(training: TrainingCapture, **changes: Any) -> Fit:

@@ -7,7 +7,6 @@ over errors that are given.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from odd_fits import part
-from painted import SilentReport
+from painted import SilentReport, TrainingMaker
 from tiny_fits import UNJUDGED
 
 from hwp_bench.capture.splits import Split
@@ -29,7 +28,6 @@ from wildghand.model.settings import read_settings
 from wildghand.plain.choice import Averaging, KeptStates
 from wildghand.plain.loop import run_fit
 
-TrainingMaker = Callable[..., TrainingCapture]
 CPU = torch.device("cpu")
 #: Of two frames: a state is kept after 5, 10 and 20 steps.
 FIT: dict[str, Any] = {**UNJUDGED, "schedule.steps": 20}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from odd_fits import a_light, odd_fit, part
+from painted import TrainingMaker
 from tiny_fits import UNJUDGED
 
 from hwp_bench.base.colors import srgb_to_linear
@@ -34,7 +34,6 @@ from wildghand.gaussians.rig import HandRig, make_rig
 PLAIN: dict[str, Any] = {**UNJUDGED, "start_colors": False}
 # Channels of the colours in the attributes and in the map.
 COLORS = slice(CHANNELS - SIZES["logit_colors"], CHANNELS)
-TrainingMaker = Callable[..., TrainingCapture]
 
 
 @pytest.fixture(scope="module")

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from painted import TrainingMaker
 from tiny_fits import UNJUDGED
 
 from hwp_bench.methods.contract import TrainingCapture
@@ -20,7 +20,6 @@ from wildghand.fitting.weights import MaskWeights
 from wildghand.model.settings import read_settings
 
 CPU = torch.device("cpu")
-TrainingMaker = Callable[..., TrainingCapture]
 
 
 @pytest.mark.parametrize("size", [60, 240])

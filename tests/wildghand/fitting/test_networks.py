@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from painted import FRAMES
+from painted import FRAMES, TrainingMaker
 from small_captures import split_file
 from tiny_fits import TINY
 from tiny_networks import write_sam_file, write_sam_folder, write_vgg19
@@ -47,7 +47,6 @@ FIT: dict[str, Any] = {
     "subject.enabled": False,
     "shadows.enabled": False,
 }
-TrainingMaker = Callable[..., TrainingCapture]
 
 
 @pytest.fixture(scope="module")

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from odd_fits import part
+from painted import TrainingMaker
 from tiny_fits import UNJUDGED
 
-from hwp_bench.methods.contract import TrainingCapture
 from wildghand.fitting.colors import start_from_colors, tint_share
 from wildghand.fitting.components import make_fit
 from wildghand.fitting.fit import Fit
@@ -23,7 +22,6 @@ from wildghand.model.settings import read_settings
 from wildghand.visibility.count import read_images, seen_anchors
 
 PLAIN: dict[str, Any] = {**UNJUDGED, "gaussians": 600, "start_colors": False}
-TrainingMaker = Callable[..., TrainingCapture]
 
 
 @pytest.fixture

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from odd_fits import a_light, odd_fit, part
+from painted import TrainingMaker
 from tiny_fits import UNJUDGED
 
 from hwp_bench.capture.splits import Split
@@ -37,7 +37,6 @@ from wildghand.visibility import (
 )
 
 QUICK: dict[str, Any] = {**UNJUDGED, "light.enabled": False}
-TrainingMaker = Callable[..., TrainingCapture]
 
 
 def begun(training: TrainingCapture, **changes: Any) -> Fit:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from odd_fits import part
+from painted import TrainingMaker
 from tiny_fits import TINY
 
 from hwp_bench.methods.contract import TrainingCapture
@@ -25,7 +25,6 @@ from wildghand.prepass import PrepassInput, judge_frames
 
 CPU = torch.device("cpu")
 ROWS = torch.tensor([0, 3])
-TrainingMaker = Callable[..., TrainingCapture]
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import scipy.spatial
 import torch
-from painted import FRAMES, SIZE, SilentReport
+from painted import FRAMES, SIZE, SilentReport, TrainingMaker
 from tiny_fits import QUICK
 
 from hwp_bench.base.errors import BadInput, DidNotConverge, UsageError
@@ -43,7 +43,6 @@ from wildghand.plain.loop import Watchers, run_fit
 from wildghand.splat import rasterize
 
 FIT: dict[str, Any] = {**QUICK, "schedule.steps": 60}
-TrainingMaker = Callable[..., TrainingCapture]
 
 
 def fitted(training: TrainingCapture, steps: int = 60, **changes: Any) -> WildGHandAvatar:

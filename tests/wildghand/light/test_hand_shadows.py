@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from painted import TrainingMaker
 from tiny_fits import UNJUDGED
 
 from hwp_bench.hands import load_template, pose_hand, vertex_normals
-from hwp_bench.methods.contract import TrainingCapture
 from wildghand.avatar.files import load_avatar, save_avatar
 from wildghand.fitting.components import make_fit
 from wildghand.fitting.light import Lighting
@@ -23,7 +22,6 @@ from wildghand.light import CastLight, HandShadows, Obstacles, ShadowTable
 from wildghand.light.hand_shadows import LIFT
 from wildghand.model.settings import read_settings
 
-TrainingMaker = Callable[..., TrainingCapture]
 SHADED: dict[str, Any] = {**UNJUDGED, "shadows.enabled": True}
 
 

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from painted import SilentReport
+from painted import SilentReport, TrainingMaker
 from tiny_fits import UNJUDGED
 
 from hwp_bench.capture import Capture
-from hwp_bench.methods.contract import Budget, TrainingCapture
+from hwp_bench.methods.contract import Budget
 from wildghand.fitting import fit_capture
 from wildghand.fitting.components import make_fit
 from wildghand.fitting.fit import Fit
@@ -24,7 +24,6 @@ from wildghand.model.settings import read_settings
 from wildghand.plain.loop import Watchers, run_fit
 
 QUICK: dict[str, Any] = {**UNJUDGED, "gaussians": 400}
-TrainingMaker = Callable[..., TrainingCapture]
 
 
 @pytest.mark.parametrize("changes", [{}, {"mode": "paper", "schedule.epochs": 0}], ids=str)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from unittest import mock
 
@@ -12,11 +11,11 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from painted import TrainingMaker
 from tiny_fits import UNJUDGED
 
 from hwp_bench.hands import load_template, pose_hand, project
 from hwp_bench.hands.raster import draw_silhouette
-from hwp_bench.methods.contract import TrainingCapture
 from wildghand.avatar.files import load_avatar, save_avatar
 from wildghand.avatar.studio import HandAngles
 from wildghand.fitting.components import make_fit
@@ -35,7 +34,6 @@ from wildghand.visibility import (
 from wildghand.visibility.count import _FAR, _depth_image
 
 SPACING = 2e-3
-TrainingMaker = Callable[..., TrainingCapture]
 
 
 def raw_attributes(count: int = 40, seed: int = 0) -> RawAttributes:

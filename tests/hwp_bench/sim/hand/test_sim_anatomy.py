@@ -7,7 +7,6 @@ model's own shapes, whose betas are known, and the mirror.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -17,6 +16,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
+from tiny_scene import SceneMaker
 
 from benchmarks.penetration import hand_penetration
 from benchmarks.subjects import ANATOMIES, SHOWN
@@ -27,7 +27,7 @@ from hwp_bench.sim.hand.anatomy import SubjectAnatomy, off_template, resized, re
 from hwp_bench.sim.hand.rigs import outlines
 from hwp_bench.sim.produce.capture import render_capture
 from hwp_bench.sim.produce.truth import distances, subject_table, template_distance
-from hwp_bench.sim.scene.scene import HandKey, Scene, hand_parameters, moment_of_key
+from hwp_bench.sim.scene.scene import HandKey, hand_parameters, moment_of_key
 from hwp_bench.sim.scene_files import load_scene
 from hwp_bench.sim.subject.hand import (
     MOVING,
@@ -71,7 +71,6 @@ def test_a_line_without_a_length_is_a_dot() -> None:
     np.testing.assert_allclose(anatomy._drawn(places, dot, 0.1), [1.0, np.exp(-1.0), 0.0])
 
 
-SceneMaker = Callable[..., Scene]
 SUBJECT = Subject(seed=11, tone=0.22, age=31.0)
 #: Deepest that gestures press other people's hands into themselves, m: what was measured with
 #: `python -m benchmarks.subjects --depth`, rounded up; frames of scenes press the hand model's so

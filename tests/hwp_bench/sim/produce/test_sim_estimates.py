@@ -6,12 +6,12 @@ backgrounds of their own and of another colour.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
+from tiny_scene import SceneMaker
 
 from hwp_bench.sim.effects import plan_frame
 from hwp_bench.sim.produce.estimates import confusable, confused_mask, estimate_mask, likeness
@@ -19,7 +19,6 @@ from hwp_bench.sim.props.behind import Behind, Face
 from hwp_bench.sim.scene.scene import Scene
 from hwp_bench.sim.subject.subject import Looks
 
-SceneMaker = Callable[..., Scene]
 SIZE = 96
 SKIN, GREEN = np.array([205, 150, 120]), np.array([60, 120, 70])
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tiny_scene import SceneMaker
 
 from hwp_bench.base.errors import BadCapture
 from hwp_bench.base.files import read_json, write_json
@@ -35,7 +35,6 @@ from hwp_bench.sim.produce.free_view import (
 from hwp_bench.sim.scene.scene import Scene, with_effects
 from hwp_bench.sim.scene_files import load_scene, scene_names
 
-SceneMaker = Callable[..., Scene]
 COUNT, SIZE = 10, 48
 
 

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tiny_scene import SceneMaker
 
 from hwp_bench.hands import load_template
 from hwp_bench.hands.poses import RestSkeleton, posed_skeleton, rest_skeleton, turned
@@ -30,13 +31,11 @@ from hwp_bench.sim.produce.estimates import (
 from hwp_bench.sim.scene.scene import (
     Estimator,
     HandKey,
-    Scene,
     hand_parameters,
     moment_of_key,
     with_effects,
 )
 
-SceneMaker = Callable[..., Scene]
 FRAMES = 60
 
 

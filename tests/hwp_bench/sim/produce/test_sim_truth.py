@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from tiny_scene import SceneMaker
 
 from hwp_bench.base.arrays import read_npz
 from hwp_bench.capture import Capture, open_capture
@@ -22,11 +22,10 @@ from hwp_bench.methods.request import frame_choice, known_oracle_inputs, open_re
 from hwp_bench.sim.hand.anatomy import SubjectAnatomy
 from hwp_bench.sim.produce.capture import render_capture
 from hwp_bench.sim.produce.truth import add_subject_mesh, subject_template, subject_templates
-from hwp_bench.sim.scene.scene import HandKey, Scene, hand_parameters, moment_of_key
+from hwp_bench.sim.scene.scene import HandKey, hand_parameters, moment_of_key
 from hwp_bench.sim.subject.hand import subject_hand, template_vertices
 from hwp_bench.sim.subject.subject import Subject
 
-SceneMaker = Callable[..., Scene]
 FRAMES, SIZE = 10, 72
 #: Far off the template: thin fingers of other lengths, moved joints.
 PERSON = """age = 31.0

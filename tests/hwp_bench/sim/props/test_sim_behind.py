@@ -6,14 +6,13 @@ channels; and the time at which something is seen.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tiny_scene import BLUR, CLEAN
+from tiny_scene import BLUR, CLEAN, SceneMaker
 
 from hwp_bench.sim.effects import plan_frame
 from hwp_bench.sim.props import behind as planes
@@ -32,7 +31,6 @@ from hwp_bench.sim.scene.scene import Scene, intrinsics, pixel_rays
 from hwp_bench.sim.scene_files import load_scene
 from hwp_bench.sim.sensor import Sensor
 
-SceneMaker = Callable[..., Scene]
 SIZE = 48
 EVERYTHING = Behind(Clutter(count=5), Face(), OtherArm())
 

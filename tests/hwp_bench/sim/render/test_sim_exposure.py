@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tiny_scene import CLEAN, LIGHT, OBJECT
+from tiny_scene import CLEAN, LIGHT, OBJECT, SceneMaker
 
 from hwp_bench.base.colors import LUMINANCE
 from hwp_bench.sim.effects import plan_frame
@@ -23,7 +23,6 @@ from hwp_bench.sim.render.frame import metered_gain, render_frame
 from hwp_bench.sim.scene.scene import Scene, with_effects
 from hwp_bench.sim.sensor import AutoControl, Sensor, sharpened
 
-SceneMaker = Callable[..., Scene]
 COUNT, SIZE = 40, 48
 STEADY = AutoControl(wander=0.0)
 

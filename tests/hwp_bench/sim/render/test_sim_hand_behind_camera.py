@@ -6,12 +6,11 @@ intersection of each ray with each triangle in float64, forwards alone.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from tiny_scene import BLUR, CLEAN, LIGHT, OBJECT
+from tiny_scene import BLUR, CLEAN, LIGHT, OBJECT, SceneMaker
 
 from hwp_bench.sim.effects import hands_at, plan_frame
 from hwp_bench.sim.geometry.surface import RenderCost, Surface
@@ -21,7 +20,6 @@ from hwp_bench.sim.render.stage import RenderStage
 from hwp_bench.sim.scene.scene import Scene, intrinsics, pixel_rays, viewmat
 from hwp_bench.sim.sensor import Sensor
 
-SceneMaker = Callable[..., Scene]
 COUNT, SIZE = 40, 12
 
 

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tiny_scene import SINGLE
+from tiny_scene import SINGLE, SceneMaker
 
 from hwp_bench.base.errors import BadInput
 from hwp_bench.hands import load_template
@@ -16,7 +14,6 @@ from hwp_bench.hands.poses import LIMITS, finger_pose, gesture, gestures, within
 from hwp_bench.sim.light.lights import focus_point
 from hwp_bench.sim.scene.scene import (
     HandMoment,
-    Scene,
     hand_parameters,
     heading_matrix,
     intrinsics,
@@ -26,8 +23,6 @@ from hwp_bench.sim.scene.scene import (
 )
 from hwp_bench.sim.scene_files import parse_scene
 from hwp_bench.sim.subject.hand import template_vertices
-
-SceneMaker = Callable[..., Scene]
 
 
 def test_named_gestures_are_within_the_limits() -> None:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tiny_scene import SINGLE
+from tiny_scene import SINGLE, SceneMaker
 
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.capture.splits import contiguous_split
@@ -16,7 +14,6 @@ from hwp_bench.sim.produce.capture import SuiteItem, suite, suite_names
 from hwp_bench.sim.scene.scene import (
     CLEAN_FROM,
     MIN_CLEAN_SHARE,
-    Scene,
     clean_share,
     level,
     moments,
@@ -34,8 +31,6 @@ from hwp_bench.sim.scene_files import (
     scene_names,
 )
 from hwp_bench.taxonomy import catalogue
-
-SceneMaker = Callable[..., Scene]
 
 
 def test_every_catalogue_capture_has_its_scene() -> None:

@@ -6,13 +6,13 @@ and luminance (Rec. 709) for the order of tones.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tiny_scene import SceneMaker
 
 from hwp_bench.hands.poses import FIRST_JOINT
 from hwp_bench.sim.effects import hands_at, plan_frame
@@ -20,13 +20,11 @@ from hwp_bench.sim.geometry.surface import RenderCost
 from hwp_bench.sim.hand.anatomy import Anatomy
 from hwp_bench.sim.render.frame import render_frame
 from hwp_bench.sim.render.stage import RenderStage
-from hwp_bench.sim.scene.scene import Scene
 from hwp_bench.sim.subject.arms import ring_mounts, wrist_loop
 from hwp_bench.sim.subject.hand import MOVING, of_side, painted, sample_skin, subject_hand
 from hwp_bench.sim.subject.subject import PLAIN, Looks, Subject
 from hwp_bench.sim.subject.wear import Glove, Polish, Ring, Tattoo, WristWear
 
-SceneMaker = Callable[..., Scene]
 PERSON = Subject(seed=11, tone=0.22, age=31.0)
 RED = (0.8, 0.05, 0.1)
 
