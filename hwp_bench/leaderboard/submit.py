@@ -29,7 +29,9 @@ from hwp_bench.leaderboard.rules import (
     check_complete,
     check_contest,
     check_current,
+    check_dates,
     check_entries,
+    check_names,
     current,
     register,
     repeats,
@@ -90,6 +92,8 @@ def submit(
         others = [*existing, *(one for one, _ in made)]
         # The rules of single entries come first: only a known suite can be complete.
         check_entries([*others, entry])
+        check_names([entry], frozenset())
+        check_dates(entry)
         check_complete(entry)
         check_bound(entry)
         if entry.name in {other.name for other in others}:

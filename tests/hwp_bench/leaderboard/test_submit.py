@@ -54,6 +54,22 @@ def submit(run: Path, out: Path, *options: str, entries: Path | None = None) -> 
     return main([*words, *options])
 
 
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [({"title": "WildGHand"}, "a method that ships"), ({}, "is not yet")],
+)
+def test_what_the_board_would_refuse_is_not_written(
+    run: Path, tmp_path: Path, capsys, changes: dict[str, str], problem: str
+) -> None:
+    results = read_results(run / "results.json")
+    started = results.started if changes else "2999-01-01T00:00:00+00:00"
+    method = replace(results.method, **changes)
+    write_results(run / "results.json", replace(results, method=method, started=started))
+    assert submit(run, tmp_path / "out") != 0
+    assert problem in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_submission_is_what_a_pull_request_needs(run: Path, tmp_path: Path, capsys) -> None:
     out = tmp_path / "out"
     before = sorted(data_folder("leaderboard").rglob("*"))
