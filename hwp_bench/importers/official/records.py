@@ -94,11 +94,12 @@ def find_file(folder: Path, named: str, *, where: Path, field: str) -> Path:
     """Find a file that a pickle names, only in the pickle's own folder.
 
     The paths in the release belong to its authors' machine. The last parts of the name are
-    searched for below the folder, the bare file name first. No name can lead out of the folder.
+    searched for below the folder, as many of them as lead to a file. No name can lead out of the
+    folder.
     """
     parts = [part for part in _SEPARATORS.split(named) if part not in ("", ".", "..")]
-    for count in range(1, len(parts) + 1):
-        candidate = folder.joinpath(*parts[-count:])
+    for first in range(len(parts)):
+        candidate = folder.joinpath(*parts[first:])
         if candidate.is_file():
             return candidate
     raise BadInput(

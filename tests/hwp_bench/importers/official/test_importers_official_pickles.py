@@ -63,6 +63,15 @@ def test_damaged_pickles_are_one_line(tmp_path: Path, raw: bytes, capsys) -> Non
     assert "output.pkl" in errors
 
 
+def test_of_files_with_one_name_the_path_decides(tmp_path: Path) -> None:
+    """As images and masks that are called alike."""
+    for folder in (tmp_path, tmp_path / "masks"):
+        folder.mkdir(exist_ok=True)
+        (folder / "0001.png").write_bytes(b"x")
+    for name, place in (("/a/masks/0001.png", "masks/0001.png"), ("/a/0001.png", "0001.png")):
+        assert find_file(tmp_path, name, where=tmp_path, field="f") == tmp_path / place
+
+
 def test_paths_in_pickles_never_leave_the_folder(tmp_path: Path) -> None:
     folder = tmp_path / "in"
     (folder / "clip").mkdir(parents=True)
