@@ -43,11 +43,16 @@ def refuse_changed(capture: Capture, kinds: Iterable[str] = ("frames", "masks"))
     found = numbers_digests(capture.hands, capture.cameras)
     for kind in kinds:
         with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
-            images = pool.map(partial(capture.image, kind), range(len(capture)))
-            found[kind] = combine(map(pixel_digest, images))
+            # Digests alone wait for their turn, not decoded images.
+            digests = pool.map(partial(_digest, capture, kind), range(len(capture)))
+            found[kind] = combine(digests)
     for part, digest in found.items():
         if error := _changed(capture, part, digest):
             raise error
+
+
+def _digest(capture: Capture, kind: str, frame: int) -> str:
+    return pixel_digest(capture.image(kind, frame))
 
 
 def _changed(capture: Capture, part: str, digest: str) -> BadCapture | None:
