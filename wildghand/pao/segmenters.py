@@ -46,7 +46,9 @@ class Superpixels:
     @property
     def identity(self) -> str:
         """Digest of everything that the regions of an image depend on."""
-        return sha256_json(["slic-1", asdict(self)])
+        import cv2
+
+        return sha256_json(["slic-1", cv2.__version__, asdict(self)])
 
     def regions(self, image: np.ndarray) -> FrameRegions:
         """Cut an image into superpixels; the same image gives the same ones.
