@@ -1,7 +1,7 @@
 """What looks and moving backgrounds cost, and what colours like skin do to estimated masks.
 
 Run from the repository: `python -m benchmarks.looks` prints, for every item, the passes that it
-adds to each frame in `hwp-bench sim plan`, the processor seconds a frame with and without it, and
+adds to each frame in `hwp-bench dev plan`, the processor seconds a frame with and without it, and
 the processor seconds that its paint takes once for a subject;
 `python -m benchmarks.looks --masks 24` prints, over that many frames before every backdrop, the
 intersection over union of estimated and exact mask, and which share of the hand's area is taken

@@ -11,7 +11,7 @@ memory. Then simulated clips, whose true landmarks get such errors, pass the sam
 its parameters are compared with the true ones. The same poses with the errors of scenes that say
 `[estimator] kind = "tracker"` stand next to it. `--picture FILE` draws that. It takes about ten
 minutes on two cores; FOLDER keeps what was computed. Constants of
-`hwp_bench/sim/produce/estimates.py` and `tracker.py` are those that it prints.
+`hwp_bench/sim/produce/estimates.py` are those that it prints.
 """
 
 from __future__ import annotations
@@ -155,7 +155,7 @@ def habit(errors: PoseErrors) -> float:
 
 
 def print_landmarks(errors: LandmarkErrors) -> None:
-    """Print the constants of `tracker_noise`."""
+    """Print the constants of simulated trackers."""
     image = rms(errors.image / errors.grown[:, None, None], (0, 2))
     world = rms(errors.world / errors.grown[:, None, None], (0, 2))
     axes = rms(errors.world, (0, 1)) / rms(errors.world)
