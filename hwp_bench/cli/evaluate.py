@@ -88,8 +88,8 @@ def _add_evaluation(parser: argparse.ArgumentParser) -> None:
     text = "limit of the fit's time; without --steps it lifts the preset's limit of steps"
     add("--budget", type=float, metavar="SECONDS", help=text)
     add("--steps", type=int, help="limit of the fit's optimizer steps")
-    text = "kill the method after this time on one capture (default 3600)"
-    add("--time-limit", type=float, default=3600.0, metavar="SECONDS", help=text)
+    text = "kill the method after this time on one capture (default: 3600 more than --budget)"
+    add("--time-limit", type=float, metavar="SECONDS", help=text)
     text = "kill the method when it takes more memory (default: nine tenths of what is free)"
     add("--memory-limit", type=float, metavar="GB", help=text)
     text = (
@@ -230,8 +230,17 @@ def _running(
     rehearse = local = args.engine == "local"
     if not args.capture and not folder:
         # Seeds of one method are alike.
-        for call in {each.manifest.name: each for each in calls}.values():
-            rehearse = not check_suite(*call, splits, rehearse=local) and rehearse
+        methods, faulty = {each.manifest.name: each for each in calls}, 0
+        for call in methods.values():
+            try:
+                rehearse = not check_suite(*call, splits, rehearse=local) and rehearse
+            except (BadMethod, MethodFailed) as error:
+                faulty += 1
+                if faulty == len(methods):
+                    raise
+                notice(f"{call.manifest.title}: {error}")
+        # In its turn it is made again, named and left out.
+        rehearse = rehearse or (local and faulty > 0)
     with engine_for(args) as engine:
         needs = needs_of(args)
         if sealed is not None:
@@ -295,6 +304,10 @@ def _evaluation_settings(args: argparse.Namespace) -> EvaluationSettings:
         value = getattr(args, name)
         if value is not None and not 0 < value < float("inf"):
             raise UsageError(f"{value} is not above 0", field=f"--{name.replace('_', '-')}")
+    if args.budget is not None and args.time_limit is not None and args.time_limit <= args.budget:
+        problem = f"{args.time_limit:g} s end a fit of {args.budget:g} s"
+        remedy = "Leave room for what is drawn after it, or leave out one of the two."
+        raise UsageError(problem, field="--time-limit", remedy=remedy)
     budget = make_budget(args.budget, args.steps)
     return EvaluationSettings(
         suite="captures" if args.capture else args.suite,

@@ -108,7 +108,7 @@ def _check(args: argparse.Namespace) -> int:
         suite=args.suite or "smoke",
         preset=args.preset,
         run=RunSettings(overrides(args.set), budget=budget),
-        time_limit=TIME_LIMIT,
+        time_limit=TIME_LIMIT + args.budget,
         confinement=Confinement(args.isolation, exposed=tuple(map(Path, args.expose))),
     )
     root = find_method(args.method)

@@ -63,10 +63,17 @@ class EvaluationSettings:
     preset: str | None = None
     #: Single settings that override the preset, seed, budget and training frames.
     run: RunSettings = field(default_factory=RunSettings)
-    #: Seconds after which a method is killed on one capture.
-    time_limit: float = DEFAULT_TIME_LIMIT
+    #: Seconds after which a method is killed on one capture; None: an hour more than its budget.
+    time_limit: float | None = None
     #: How its process is confined, and its memory limit.
     confinement: Confinement = field(default_factory=Confinement)
+
+    @property
+    def killed_after(self) -> float:
+        """Seconds after which a method is killed on one capture."""
+        if self.time_limit is not None:
+            return self.time_limit
+        return DEFAULT_TIME_LIMIT + (self.run.budget.seconds or 0.0)
 
 
 @dataclass(frozen=True)
@@ -159,11 +166,15 @@ def _evaluate(
     _refuse_changed(evaluation)
     remove_tree(folder)
     folder.mkdir(parents=True)
-    output = folder / "run"
+    output, kind = folder / "run", evaluation.manifest.kind
+    entered = time.perf_counter()
     record, failure = _run(evaluation, output, on_progress)
+    wall = 0.0 if kind == "predictions" else time.perf_counter() - entered
     _refuse_edited(evaluation)
-    # A run that failed left nothing that would be scored.
-    record = record or RunRecord(output / "none", RunFacts(), 0.0, free_view=output / "none")
+    # A run that failed left nothing that would be scored. Our worker would have drawn the clip;
+    # whether others offer views of it is not known.
+    lost = output / "none" if kind == "python" else None
+    record = record or RunRecord(output / "none", RunFacts(), wall, free_view=lost)
     started = time.perf_counter()
     scored = score_frames_of(targets, record.predictions, capture.size, evaluation.networks)
     score_seconds = time.perf_counter() - started
@@ -220,7 +231,7 @@ def _run(
                 evaluation.capture.info.id,
                 request,
                 output,
-                time_limit=settings.time_limit,
+                time_limit=settings.killed_after,
                 confinement=_confinement(evaluation, output),
                 on_progress=on_progress,
             )
@@ -399,6 +410,14 @@ def evaluate_elsewhere(
             f"what LPIPS or FLIP needs ({', '.join(missing)}) is not on this machine",
             remedy="Put them on every node, or on none.",
         )
+    for path in same[1].confinement.exposed:
+        if not path.exists():
+            raise HwpError(
+                "is not on this machine",
+                where=path,
+                field="--expose",
+                remedy="Put what --expose and settings name at the same place on every node.",
+            )
     manifest = read_manifest(inputs["method"] if shipped is None else PACKAGES / shipped)
     evaluation = CaptureEvaluation(
         manifest,

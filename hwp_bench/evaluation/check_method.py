@@ -98,7 +98,7 @@ def check_method(
                     name,
                     request,
                     output,
-                    time_limit=settings.time_limit,
+                    time_limit=settings.killed_after,
                     confinement=confinement,
                     check=True,
                 )

@@ -233,7 +233,7 @@ class Plan:
         rehearse_method(
             self.manifest,
             settings.run,
-            time_limit=min(settings.time_limit, REHEARSAL_SECONDS),
+            time_limit=min(settings.killed_after, REHEARSAL_SECONDS),
             confinement=settings.confinement,
         )
 

@@ -1,4 +1,4 @@
-"""Keys of evaluations stay what they were. Oracle: keys that earlier versions stored in results."""
+"""Keys of evaluations stay what they were; other machines. Oracle: keys of stored results."""
 
 from __future__ import annotations
 
@@ -6,8 +6,19 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from hwp_bench.evaluation.capture_evaluation import CaptureEvaluation, EvaluationSettings
+import pytest
+from small_captures import CaptureMaker
+from small_methods import write_submission
+
+from hwp_bench.base.errors import HwpError
+from hwp_bench.capture.splits import contiguous_split
+from hwp_bench.evaluation.capture_evaluation import (
+    CaptureEvaluation,
+    EvaluationSettings,
+    evaluate_elsewhere,
+)
 from hwp_bench.methods.contract import Budget, RunSettings
+from hwp_bench.run.engine.job import ignore_progress
 from hwp_bench.run.sandbox.confinement import Confinement
 
 #: A method, a capture and a split, of which only name and digests enter a key.
@@ -33,3 +44,14 @@ def test_a_stored_result_is_found_again_under_its_key(tmp_path: Path) -> None:
         networks={"vgg": None, "alex": None},  # type: ignore[dict-item]
     )
     assert full.key == "f0f7518bae751f2dbf21fccb8bb0193b3d135bd66a777531e78e044aee26d2f6"
+
+
+def test_what_is_exposed_and_not_on_a_machine_is_named(
+    make_capture: CaptureMaker, tmp_path: Path
+) -> None:
+    capture = make_capture("tiny", frames=20)
+    entry = write_submission(tmp_path / "entry", {"tiny/000018.png": capture.frame(18)})
+    shown = EvaluationSettings(confinement=Confinement(exposed=(tmp_path / "weights",)))
+    same, inputs = (contiguous_split("tiny", 20), shown), {"method": entry, "capture": capture.root}
+    with pytest.raises(HwpError, match="weights: --expose: is not on this machine"):
+        evaluate_elsewhere(same, [], None, "k", inputs, tmp_path / "out", ignore_progress)

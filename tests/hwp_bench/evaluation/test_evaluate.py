@@ -11,7 +11,8 @@ import pytest
 from small_captures import CaptureMaker
 from small_methods import write_submission
 
-from hwp_bench.base.errors import BadCapture, BadImage, BadSplit, UsageError
+import hwp_bench
+from hwp_bench.base.errors import BadCapture, BadImage, BadSplit, MethodFailed, UsageError
 from hwp_bench.base.images import write_image
 from hwp_bench.capture import Capture, CaptureWriter
 from hwp_bench.capture.splits import contiguous_split
@@ -213,12 +214,32 @@ def test_a_crash_on_one_capture_loses_nothing_and_is_tried_again(captures, tmp_p
     results = run(method, captures, out)
     assert "RuntimeError: no luck" in results.captures[0].failure
     assert results.captures[1].failed_frames == 0
+    # The process of the failed one took its time too.
+    assert results.captures[0].wall_seconds > 0.05
     assert "RuntimeError: no luck" in (out / "captures" / "single" / "log.txt").read_text()
     # The folder of the run is gone; the text must not lead there.
     assert "/run/" not in results.captures[0].failure
     assert "log.txt next to result.json" in results.captures[0].failure
     run(method, captures, out)
     assert (method.parent / "fits.log").read_text() == "pair "
+
+
+def test_a_fit_of_an_hour_is_not_killed_after_an_hour(
+    captures, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    limits: list[float] = []
+
+    def stop(*given: object, time_limit: float, **more: object) -> None:
+        limits.append(time_limit)
+        raise MethodFailed("stopped")
+
+    monkeypatch.setattr("hwp_bench.evaluation.capture_evaluation.run_method", stop)
+    method, root = counting_method(tmp_path / "method"), captures[0].root
+    hwp_bench.evaluate(method, root, tmp_path / "out", seconds=3600.0)
+    assert limits == [7200.0]
+    words = ["evaluate", str(method), "--capture", str(root), "-o", str(tmp_path / "other")]
+    assert main([*words, "--budget", "60", "--time-limit", "60"]) == 2
+    assert "--time-limit: 60 s end a fit of 60 s" in capsys.readouterr().err
 
 
 def test_faults_of_the_capture_are_errors_before_the_method_runs(

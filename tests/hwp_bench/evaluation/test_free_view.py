@@ -89,6 +89,15 @@ def run(entry: Path, capture: Capture, out: Path, how: EvaluationSettings = OPEN
     return result
 
 
+def test_who_offers_no_clip_is_not_penalised_for_it_where_it_fails(
+    capture: Capture, tmp_path: Path
+) -> None:
+    entry = write_submission(tmp_path / "entry", {"other/000018.png": capture.frame(18)})
+    result = run(entry, capture, tmp_path / "out")
+    assert "has no predictions" in (result.failure or "")
+    assert result.free_view is None
+
+
 def test_the_truth_scores_perfectly_and_a_missing_frame_costs_its_penalty(
     capture: Capture, tmp_path: Path
 ) -> None:

@@ -56,6 +56,17 @@ def _method(
     return folder
 
 
+def test_a_field_goes_on_without_a_method_that_cannot_be_made(tmp_path: Path, capsys) -> None:
+    _method(tmp_path / "mine")
+    other = _method(tmp_path / "other", code="import no_such_package") / "method.toml"
+    other.write_text(other.read_text().replace('name = "mine"', 'name = "other"'))
+    with pytest.raises(Rendered):
+        main(["evaluate", "mine", "other", "--suite", "smoke"])
+    assert "cannot be made" in capsys.readouterr().err
+    # None of these can be made.
+    assert main(["evaluate", "other", "--suite", "smoke"]) == 1
+
+
 WRONG = (
     (["--set", "levl=1"], 1, "Did you mean 'level'?"),
     (["--set", "light.degre=1"], 1, "Did you mean 'light.degree'?"),
