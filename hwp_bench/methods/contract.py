@@ -80,9 +80,9 @@ class MethodFactory(Protocol):
 class Avatar(Protocol):
     """A fitted hand (or pair of hands) that can be drawn in any pose from any camera.
 
-    It may have attributes that the result keeps: `steps`, the step of the state that is returned
-    (without it, the last step that was reported), and `device`, such as `cuda` (without it, `cuda`
-    where torch has used it, else `cpu`).
+    It may have attributes: `steps`, the step of the state that is returned (without it, the last
+    step that was reported; a result counts all that were taken), and `device`, such as `cuda`
+    (without it, `cuda` where torch has used it, else `cpu`).
     """
 
     def render(self, hands: Mapping[str, HandPose], camera: Camera) -> np.ndarray:

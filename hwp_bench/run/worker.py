@@ -147,6 +147,7 @@ def run(training: TrainingCapture, factory: MethodFactory, output: Path, draw: D
     notice(f"Ready after {ready_seconds:.1f} s, which do not count as seconds of the fit.")
     report = ReportClock(training.run.budget, record, output / PROGRESS)
     avatar = method.fit(training, training.run.budget, report)
+    _wait_for_gpu()
     fit_seconds, cpu = report.elapsed, report.cpu_seconds
     final_step = int(getattr(avatar, "steps", report.last))
     explain = getattr(avatar, "write_diagnostics", None)
@@ -166,13 +167,21 @@ def run(training: TrainingCapture, factory: MethodFactory, output: Path, draw: D
         ready_seconds=ready_seconds,
         render_seconds=render_seconds,
         curve_seconds=report.paused,
-        steps=final_step,
+        # A fit that went back to an earlier state has spent its time on the later steps too.
+        steps=report.last,
         peak_memory=peak_memory(),
         device=str(getattr(avatar, "device", _used_device()))[:100],
         checkpoint_frames=frames,
         checkpoints=report.checkpoints,
     )
     write_json(output / RUN, asdict(facts))
+
+
+def _wait_for_gpu() -> None:
+    """Wait for what a GPU was told: that belongs to the fit, not to what is drawn next."""
+    cuda = sys.modules.get("torch.cuda")
+    if cuda is not None and cuda.is_initialized():
+        cuda.synchronize()
 
 
 def _used_device() -> str:
@@ -335,7 +344,9 @@ class ReportClock:
         """Take a checkpoint now; the clock stands still meanwhile."""
         step = int(step)
         self.last = max(self.last, step)
-        seconds = self.elapsed if seconds is None else seconds
+        if seconds is None:
+            _wait_for_gpu()
+            seconds = self.elapsed
         entered, entered_cpu = time.perf_counter(), cpu_seconds()
         self._due = [moment for moment in self._due if moment > seconds]
         self._due_steps = [due for due in self._due_steps if due > step]

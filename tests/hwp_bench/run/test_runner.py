@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,6 +16,7 @@ from hwp_bench.base.errors import MethodFailed
 from hwp_bench.evaluation.scoring import read_prediction
 from hwp_bench.methods.contract import Budget
 from hwp_bench.methods.manifest import MethodManifest, read_manifest
+from hwp_bench.run import worker
 from hwp_bench.run.runner import DEFAULT_TIME_LIMIT, run_method
 from hwp_bench.run.sandbox.supervise import MAX_LOG_BYTES
 from hwp_bench.run.worker import ReportClock, checkpoint_times, cpu_seconds
@@ -82,9 +84,38 @@ def test_a_python_method_fits_and_renders(request_folder: Path, tmp_path: Path) 
 
 def test_a_method_that_uses_a_gpu_need_not_say_so(request_folder: Path, tmp_path: Path) -> None:
     # In the place of a GPU, what torch says once it has begun to use one.
-    body = "import sys; sys.modules['torch.cuda'] = type('', (), {'is_initialized': lambda: True})"
+    body = (
+        "import sys; sys.modules['torch.cuda'] = type("
+        "'', (), {'is_initialized': lambda: True, 'synchronize': lambda: None})"
+    )
     record = _run(python_method(tmp_path / "m", body), request_folder, tmp_path)
     assert record.facts.device == "cuda"
+
+
+def test_the_clock_waits_for_what_a_gpu_was_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Two seconds of work are queued when the checkpoint is taken; drawing would wait for them.
+    now, queued = [100.0], [2.0]
+
+    def wait() -> None:
+        now[0] += queued.pop() if queued else 0.0
+
+    gpu = SimpleNamespace(is_initialized=lambda: True, synchronize=wait)
+    monkeypatch.setitem(sys.modules, "torch.cuda", gpu)
+    monkeypatch.setattr(worker, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    clock = ReportClock(Budget(), lambda index, avatar: wait(), tmp_path / "progress.json")
+    clock.take(1, None)  # type: ignore[arg-type]
+    assert (clock.elapsed, clock.paused) == (2.0, 0.0)
+
+
+def test_steps_after_the_returned_state_were_taken_too(
+    request_folder: Path, tmp_path: Path
+) -> None:
+    body = "back = Avatar(total / len(training.train)); back.steps = 3; return back"
+    facts = _run(python_method(tmp_path / "m", body), request_folder, tmp_path).facts
+    assert facts.checkpoints[-1].step == 3
+    assert facts.steps == 15
 
 
 def test_three_channels_are_as_good_as_four(request_folder: Path, tmp_path: Path) -> None:
