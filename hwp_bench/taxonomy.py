@@ -159,13 +159,13 @@ SUITES = (*SIMULATED_SUITES, *REAL_SUITES)
 SUITE_TEXTS: Mapping[str, str] = MappingProxyType(
     {
         "smoke": "two captures, to see that a method runs",
-        "mini": "eight of the paper's captures, simulated and short",
+        "mini": "eight of the paper's captures, simulated and short; WildGHand's design set",
         "full-lite": "the paper's eleven captures, simulated, every twelfth frame",
         "full": "the paper's eleven captures, simulated, every frame",
         "wild-dev": "simulated hands as various as the world, for tuning",
         "wild-test": "simulated hands as various as the world, on which nothing was tuned",
         "persistent": "simulated, with perturbations that last: 10 % of training frames are clean",
-        "real-1": "real clips, on which nothing was tuned",
+        "real-1": "real clips, whose test scores decided on some parts of WildGHand",
     }
     | {
         f"persistent-clean{share}": f"as persistent, with {share} % of training frames clean"

@@ -38,7 +38,7 @@ from hwp_bench.taxonomy import PERTURBATIONS, perturbation
 OURS, PLAIN = "wildghand", "plain"
 #: By how much another method must be ahead on a capture to be named, dB.
 BEHIND = 0.5
-#: The suites that are shown first: those that nothing was designed on.
+#: The suites that are shown first: the one that nothing was tuned on, and the real one.
 _FIRST = ("wild-test", "real-1")
 #: Decibels that may stand outside of a block, by page: see `find_faults`.
 TYPED = "docs/results.toml"
