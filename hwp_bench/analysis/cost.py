@@ -237,9 +237,6 @@ def _cost_table(
     ]
     if stretch:
         text.append(f"Mean over log time: from {stretch[0]:.3g} to {stretch[1]:.3g} s.")
-    lost = [f"{cost.label}: {cost.fits - cost.curves}" for cost in costs if cost.curves < cost.fits]
-    if lost:
-        text.append(f"Fits without a curve, left out: {'; '.join(lost)}.")
     return table_of("Accuracy against time", columns, [*text, *notes])
 
 
@@ -281,6 +278,11 @@ def _front_table(front: Sequence[FrontPart], metric: str) -> Table:
     return table_of("Pareto front", columns, [note])
 
 
+def _lost_notes(costs: Sequence[MethodCost]) -> list[str]:
+    lost = [f"{cost.label}: {cost.fits - cost.curves}" for cost in costs if cost.curves < cost.fits]
+    return [f"Fits without a curve, left out: {'; '.join(lost)}."] if lost else []
+
+
 def machine_notes(results: Sequence[Results]) -> list[str]:
     """Return the machines, with warnings: several of them, or runs without a sandbox."""
     machines = {
@@ -297,8 +299,8 @@ def machine_notes(results: Sequence[Results]) -> list[str]:
 
 
 def run_seconds(capture: CaptureResult) -> dict[str, float] | None:
-    """Return the seconds of one run by part; None where they were not put on record."""
-    if capture.job_seconds is None or not capture.wall_seconds:
+    """Return the seconds of one run by part; None where it failed, or they are not on record."""
+    if capture.failure or capture.job_seconds is None or not capture.wall_seconds:
         return None
     said = {
         "fit": capture.fit_seconds or 0.0,
@@ -350,6 +352,8 @@ class CostAnalysis:
     front: tuple[FrontPart, ...]
     #: The tables by name.
     tables: Mapping[str, Table]
+    #: What the numbers lack or mix: fits without a curve, machines, runs without a sandbox.
+    notes: tuple[str, ...]
 
     def as_object(self) -> dict[str, Any]:
         """Return plain JSON data."""
@@ -387,7 +391,8 @@ def analyse_cost(
         )
     costs = method_costs(runs, metric, budgets, reference)
     front = pareto_front(curves, metric_facts(metric).higher_is_better)
-    notes = machine_notes([result for run in runs for result in run.seeds.values()])
+    results = [result for run in runs for result in run.seeds.values()]
+    notes = (*_lost_notes(costs), *machine_notes(results))
     label = reference.label if reference else None
     tables = {
         "cost": _cost_table(costs, metric, label, window(methods), notes),
@@ -396,4 +401,4 @@ def analyse_cost(
     }
     if (seconds := seconds_table(runs)) is not None:
         tables["seconds"] = seconds
-    return CostAnalysis(metric, tuple(costs), tuple(curves), tuple(front), tables)
+    return CostAnalysis(metric, tuple(costs), tuple(curves), tuple(front), tables, notes)

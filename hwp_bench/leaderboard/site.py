@@ -137,17 +137,18 @@ def _avatars(folder: Path, page: MethodPage) -> dict[str, str]:
             for number, capture in enumerate(entry.results.captures):
                 address = f"reports/{entry.name}/avatars/0-{number}.html"
                 if (folder / address).is_file():
-                    found.setdefault(capture.id, address)
+                    found.setdefault(f"{capture.id} of {row.suite}", address)
     return found
 
 
 def _made_with(row: BoardRow) -> dict[str, str]:
     """Say in words how the numbers of a row were made; empty where it is not known."""
-    results = row.first
-    captures = row.captures
+    results, captures = row.first, row.captures
+    runs = [entry.counted for entry in row.entries]
+    told = [provenance(one) for one in runs]
     cpu = [capture.cpu_seconds for capture in captures if capture.cpu_seconds is not None]
     seeds = ", ".join(str(seed) for seed in row.seeds)
-    return provenance(results) | {
+    return {name: _joined(one[name] for one in told) for name in told[0]} | {
         "Suite, frames, seed": f"{results.suite}, {results.frames}, {seeds}",
         "Digests of training data": _named(
             {name: " ".join(own)} for name, own in results.method.training.simulated.items()
@@ -156,7 +157,9 @@ def _made_with(row: BoardRow) -> dict[str, str]:
         "Protocol": ", ".join(results.protocols),
         "Seconds on one core": f"{sum(cpu) / len(cpu):.1f} a fit" if cpu else "",
         "Isolation": ", ".join(sorted({one.isolation for one in captures if one.isolation})),
-        "Digest of the toolkit's code": str(results.environment.get("code", "")),
+        "Digest of the toolkit's code": _joined(
+            str(one.environment.get("code", "")) for one in runs
+        ),
         "Checked": row.level,
         "Badge": row.badge,
         "Submitted by": _joined(entry.submission.by for entry in row.entries),
@@ -313,7 +316,8 @@ def curve_plot(rows: Sequence[BoardRow]) -> dict[str, Any] | None:
 
     Returns:
         The plot (`figure`), the labels of the methods in the order of their colours (`methods`),
-        of those on the Pareto front for some time (`front`), and what the bands are (`bands`).
+        of those on the Pareto front for some time (`front`), what the bands are (`bands`), and what
+        the curves lack or mix (`notes`).
         None where no whole row left a curve, or where one submitted twice cannot be told apart.
     """
     whole = sorted((row for row in rows if row.whole), key=lambda row: -row.scores[METRIC])
@@ -330,7 +334,13 @@ def curve_plot(rows: Sequence[BoardRow]) -> dict[str, Any] | None:
     leading = {part.label for part in cost.front}
     front = [label for label in order if label in leading]
     bands = bands_text(cost.curves)
-    return {"figure": figure, "methods": list(order), "front": front, "bands": bands}
+    return {
+        "figure": figure,
+        "methods": list(order),
+        "front": front,
+        "bands": bands,
+        "notes": cost.notes,
+    }
 
 
 def _scores_json(row: BoardRow, metric: str) -> str:

@@ -13,10 +13,14 @@ var Board = {
   },
 
   // Return the numbers of the rows, in the order that a column asks for; equal rows keep theirs.
-  order: function (cells, descending) {
+  // Rows that lack a part of their suite (1 in `lacks`, else 0) come after the others.
+  order: function (cells, descending, lacks) {
     return cells
       .map(function (cell, index) { return [cell, index]; })
-      .sort(function (a, b) { return Board.compare(a[0], b[0], descending) || a[1] - b[1]; })
+      .sort(function (a, b) {
+        return (lacks ? lacks[a[1]] - lacks[b[1]] : 0) ||
+          Board.compare(a[0], b[0], descending) || a[1] - b[1];
+      })
       .map(function (pair) { return pair[1]; });
   },
 
@@ -107,7 +111,8 @@ if (typeof document !== "undefined") {
       // Rows are compared within their suite alone.
       groups.forEach(function (group) {
         var cells = group.rows.map(function (row) { return value(row, state.sort); });
-        Board.order(cells, state.down === "1").forEach(function (index) {
+        var lacks = group.rows.map(function (row) { return Number(row.dataset.lacks); });
+        Board.order(cells, state.down === "1", lacks).forEach(function (index) {
           group.body.appendChild(group.rows[index]);
         });
         group.section.hidden = group.rows.every(function (row) { return row.hidden; });

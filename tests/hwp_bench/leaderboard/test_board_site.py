@@ -88,7 +88,7 @@ def test_suites_stand_apart_with_the_one_that_nothing_was_tuned_on_first() -> No
     page = page_of(made)
     assert re.findall(r'<h2 id="h-\S+">(.*?)</h2>', page)[:2] == [
         "wild-test: simulated hands as various as the world, on which nothing was tuned",
-        "mini: eight of the paper&#39;s captures, simulated and short",
+        "mini: eight of the paper&#39;s captures, simulated and short; WildGHand&#39;s design set",
     ]
     assert page.count("16 s, 100,000 steps</td>") == 4
 
@@ -144,6 +144,10 @@ def test_sorting_puts_what_was_not_measured_last(board) -> None:
     assert order([3, 1, None, 2, 10], True) == [4, 0, 3, 1, 2]
     assert order(["b", "a", "b"], True) == [0, 2, 1]
     assert order([1, 1, 1], True) == [0, 1, 2]
+    # Rows that lack a part of their suite come last, whichever way.
+    lacking = "JSON.stringify(Board.order([3, 1, 2], {}, [1, 0, 0]))"
+    assert json.loads(board.eval(lacking.format("true"))) == [2, 1, 0]
+    assert json.loads(board.eval(lacking.format("false"))) == [1, 2, 0]
 
 
 def test_filters_and_addresses(board) -> None:
@@ -621,6 +625,28 @@ def test_the_plot_of_a_table_names_every_method_and_the_front(
     assert list(plot["front"]) == [f"M{count - 1}"]
     assert plot["figure"].count('class="band"') == bands
     assert plot["bands"].startswith("shaded bands" if bands else "no intervals")
+
+
+def test_the_plot_says_that_machines_differ_and_which_fits_it_lacks() -> None:
+    entries = []
+    for number, processor in enumerate(("slow", "fast")):
+        made = results(f"m{number}")
+        captures = [replace(made.captures[0], curve=[]), *made.captures[1:]] if number else None
+        made = replace(made, environment={"processor": processor, "cores": 2})
+        entries.append(make_entry(replace(made, captures=captures or made.captures)))
+    plot = curve_plot(board_rows(entries))
+    assert plot is not None
+    assert "Fits without a curve, left out: M1: 1." in plot["notes"]
+    assert any("the seconds do not compare" in note for note in plot["notes"])
+
+
+def test_a_page_names_the_machine_of_every_seed(tmp_path: Path) -> None:
+    first = make_entry(results("plain"))
+    there = {**first.results.environment, "processor": "Another CPU", "code": "f" * 64}
+    second = make_entry(replace(first.results, seed=1, environment=there))
+    page = written(tmp_path, first, second)["Plain"]
+    assert "Another CPU" in page
+    assert "f" * 64 in page
 
 
 def test_without_curves_there_is_no_plot() -> None:

@@ -255,6 +255,20 @@ def test_the_report_leads_to_a_copy_of_the_page(source: ResultsSource, tmp_path:
     assert (page.parent / link).read_text() == PAGE
 
 
+def test_avatars_of_two_suites_are_told_apart(tmp_path: Path) -> None:
+    sources = []
+    for name in ("mini", "full-lite"):  # both have a capture0
+        made = replace(complete_results("mine", suite_name=name), seed=0)
+        sources.append(ResultsSource(made, tmp_path / name))
+        put(sources[-1])
+    entries = [make_entry(one.results) for one in sources]
+    site = build_site(tmp_path / "site", entries, sources, avatar_pages=True).parent
+    (page,) = (site / "methods").glob("*.html")
+    text = page.read_text("utf-8")
+    assert "of mini</a>" in text
+    assert "of full-lite</a>" in text
+
+
 def test_nothing_is_copied_that_nobody_asked_for(source: ResultsSource, tmp_path: Path) -> None:
     put(source, "<!doctype html><script>alert(1)</script>")
     page = write_report(tmp_path / "report", [source])
