@@ -32,6 +32,8 @@ _TABLES = (
     *("robustness", "severity", "clean-share", "novelty", "outline", "free-view", "bias", "seeds"),
     *("sharpness", "discrimination"),
 )
+# Tables in which a method is compared with a chosen one.
+_WITH_BASELINE = ("robustness", "discrimination")
 _TABLE = """examples:
   hwp-bench table runs/plain-mini
   hwp-bench table runs/plain-mini runs/mine-mini --by perturbations
@@ -87,6 +89,10 @@ def _table(args: argparse.Namespace) -> int:
     if args.figure is not None and args.by != "clean-share":
         problem = f"there is none of the table {args.by!r}"
         raise UsageError(problem, field="--figure", remedy="Give --by clean-share.")
+    if args.baseline is not None and (args.paper or args.by not in _WITH_BASELINE):
+        problem = f"the table {args.paper or args.by!r} has none"
+        remedy = f"Give --by {' or '.join(_WITH_BASELINE)}."
+        raise UsageError(problem, field="--baseline", remedy=remedy)
     request = TableRequest(
         args.results, args.by, args.paper, args.published, args.baseline, args.capture
     )

@@ -322,11 +322,11 @@ def write_reports(
     def write(place: Path, own: Sequence[ResultsSource], base: str | None) -> Path:
         return write_report(place, own, captures, base=base, title=title, avatar_pages=avatar_pages)
 
-    if len(groups) < 2:
-        return [write(folder, sources, base)]
     names = [{source.results.method.name for source in group.sources} for group in groups]
     if base is not None and not any(base in known for known in names):
         raise UsageError(f"no result is of {base!r}", field="--baseline")
+    if len(groups) < 2:
+        return [write(folder, sources, base)]
     pages, rows = [], []
     for group, known in zip(groups, names, strict=True):
         pages.append(write(folder / group.label, group.sources, base if base in known else None))

@@ -222,6 +222,14 @@ def test_a_whole_folder_of_runs_is_taken(command: list[str], runs: Path, capsys)
         assert "Data" in said.out
 
 
+def test_a_base_that_is_not_there_or_has_no_effect_is_refused(runs: Path, capsys) -> None:
+    words = [str(runs / "plain"), str(runs / "mine"), "--baseline", "nobody"]
+    assert main(["report", *words, "-o", str(runs.parent / "out")]) == 2
+    assert "no result is of 'nobody'" in capsys.readouterr().err
+    assert main(["table", *words]) == 2
+    assert "--baseline: the table 'overall' has none" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
 def test_nothing_but_other_files_is_an_error(command: list[str], runs: Path, capsys) -> None:
     extra = [] if command[0] == "table" else ["-o", str(runs.parent / "out")]
