@@ -114,7 +114,7 @@ def scores_by_share(
             field="--capture",
             remedy="Name the capture folders, or render the suite on this machine.",
         )
-    titles = dict(zip(firsts, labels([*firsts.values()]), strict=True))
+    titles = dict(zip(firsts, labels([*firsts.values()], seeds=False), strict=True))
     first = next(iter(curves))
 
     def behind(key: str, share: float) -> Estimate | None:

@@ -204,10 +204,13 @@ def _notes(runs: Sequence[MethodRuns]) -> list[str]:
     if not runs:
         return []
     first = runs[0].first
-    seeds = max(len(run.seeds) for run in runs)
+    counts = {run.label: len(run.seeds) for run in runs}
+    seeds = f"{len(runs[0].seeds)} seed(s)"
+    if len(set(counts.values())) > 1:
+        seeds = f"seeds ({', '.join(f'{name} {count}' for name, count in counts.items())})"
     return [
         f"Measured rows: {first.suite}, {len(first.captures)} captures, protocol paper-wildghand; "
-        f"means over captures of means over test frames, over {seeds} seed(s).",
+        f"means over captures of means over test frames, over {seeds}.",
     ]
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from hwp_bench.analysis.columns import Filled, block_breaks, score_column, score_title, table_of
 from hwp_bench.analysis.compare import Ranking, macro_by_seed, macro_mean, rank_methods, verdict
-from hwp_bench.analysis.cost import BUDGETS, MethodCost, method_costs
+from hwp_bench.analysis.cost import BUDGETS, MethodCost, machine_notes, method_costs
 from hwp_bench.analysis.discrimination import item_statistics
 from hwp_bench.analysis.pairing import MethodRuns, common_metrics, group_runs, refuse_unlike
 from hwp_bench.base.errors import UsageError
@@ -104,7 +104,8 @@ def cost_table(runs: Sequence[MethodRuns]) -> Table:
         "Front: no other method has at least this test score in as few seconds. Means over "
         "captures and seeds; memory is the largest. Seconds compare on one machine only.",
     )
-    return table_of("Accuracy and cost", columns, notes)
+    results = [result for run in runs for result in run.seeds.values()]
+    return table_of("Accuracy and cost", columns, (*notes, *machine_notes(results)))
 
 
 def on_front(
@@ -142,7 +143,9 @@ def robustness_table(sources: Sequence[ResultsSource], base: str | None = None) 
     starts = [_base(perturbed, base, run) for run, _ in pairs]
     start = next(filter(None, starts), None)
     names = common_metrics(runs, ROBUST)
-    columns: list[Filled] = [(Column("Method"), labels([run.first for run, _ in pairs]))]
+    columns: list[Filled] = [
+        (Column("Method"), labels([run.first for run, _ in pairs], seeds=False))
+    ]
     for name in names:
         label, head = metric_facts(name).label, score_column(name)
         bases = [macro_mean(start, name) if start else None for start in starts]

@@ -199,17 +199,24 @@ def _of_protocol(protocol: Protocol) -> tuple[str, ...]:
     return tuple(facts.name for facts in METRICS if facts.protocol == protocol.name)
 
 
-def labels(results: Sequence[Results]) -> list[str]:
-    """Return a title for each evaluation, with what differs where titles repeat."""
-    told = []
+def labels(results: Sequence[Results], *, seeds: bool = True) -> list[str]:
+    """Return a title for each evaluation, with what differs where titles repeat.
+
+    Without `seeds` each stands for all seeds of its method.
+    """
+    told, telling = [], [text for text in _TELLING if seeds or text is not _seed]
     for result, settings in zip(results, differing_settings(results), strict=True):
         twins = [other for other in results if other.method.title == result.method.title]
-        parts = [text(result) for text in _TELLING if len({text(twin) for twin in twins}) > 1]
+        parts = [text(result) for text in telling if len({text(twin) for twin in twins}) > 1]
         parts += [settings] if settings else []
         if not parts and len(twins) > 1:
-            parts = [text(result) for text in _TELLING]
+            parts = [text(result) for text in telling]
         told.append(result.method.title + (f" ({', '.join(parts)})" if parts else ""))
     return told
+
+
+def _seed(result: Results) -> str:
+    return f"seed {result.seed}"
 
 
 #: The differences between evaluations of one title.
@@ -220,7 +227,7 @@ _TELLING: tuple[Callable[[Results], str], ...] = (
         ", ".join(f"{value:g} {name}" for name, value in result.budget.items() if value)
         or "no limit"
     ),
-    lambda result: f"seed {result.seed}",
+    _seed,
     lambda result: result.method.digest[:8],
 )
 
@@ -247,7 +254,10 @@ def _scope(results: Sequence[Results]) -> str:
     return "; ".join(text for *_, text in sorted(every))
 
 
-_NOTE = "Means over seeds, where a method has several; `--by seeds` shows how they spread."
+_NOTE = (
+    "Means over seeds, where a method has several; counts, such as failed frames, are added up. "
+    "`--by seeds` shows how they spread."
+)
 #: Heading of the column that names evaluations.
 _METHOD = "Method"
 
@@ -267,7 +277,7 @@ def over_seeds(table: Table, results: Sequence[Results]) -> Table:
     names = dict(zip(map(id, results), labels(results), strict=True))
     titles = {
         names[id(result)]: title
-        for run, title in zip(runs, labels([run.first for run in runs]), strict=True)
+        for run, title in zip(runs, labels([run.first for run in runs], seeds=False), strict=True)
         for result in run.seeds.values()
     }
     place = [column.title for column in table.columns].index(_METHOD)

@@ -310,3 +310,13 @@ def test_it_is_asked_for_by_name_and_stands_on_the_page(
     ((method, uri),) = page["captures"][0]["views"]
     assert method == "One"
     assert uri.startswith("data:image/jpeg;base64,")
+
+
+def test_a_mean_over_seeds_is_not_called_by_one_of_them() -> None:
+    found = []
+    for seconds, seed in ((30.0, 0), (30.0, 1), (60.0, 1), (60.0, 2)):
+        budget = {"seconds": seconds, "steps": None}
+        found.append(made_results("mine", lambda c, f, s: 20.0 + c, seed=seed, budget=budget))
+    table = over_seeds(all_tables(found)["overall"], found)
+    assert [row[0] for row in table.rows] == ["Mine (30 seconds)", "Mine (60 seconds)"]
+    assert "added up" in table.notes[-1]
