@@ -141,8 +141,11 @@ def link_terms(page: str, terms: Sequence[str]) -> str:
 
 def build(folder: Path) -> Path:
     """Write the pages into a folder and build the site from them; a warning ends it."""
-    shutil.rmtree(folder / "docs", ignore_errors=True)
-    write_pages(folder / "docs")
+    docs = folder / "docs"
+    if docs.exists() and not (docs / "api" / "commands.md").is_file():
+        raise SystemExit(f"{docs}: holds something else than pages of this program")
+    shutil.rmtree(docs, ignore_errors=True)
+    write_pages(docs)
     config = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
     (folder / "mkdocs.yml").write_text(config.replace("$ROOT", str(ROOT)), encoding="utf-8")
     program = [sys.executable, "-m", "zensical", "build", "--clean", "--strict"]
