@@ -14,7 +14,7 @@ import numpy as np
 
 from hwp_bench.base.console import notice, progress
 from hwp_bench.base.errors import BadInput, UsageError, bounded
-from hwp_bench.base.files import sha256_file, sha256_json
+from hwp_bench.base.files import check_places, sha256_file, sha256_json
 from hwp_bench.base.images import is_blank, read_rgb, write_image
 from hwp_bench.capture.folder import refuse_taken
 from hwp_bench.capture.schema import EXTRA, Cameras, check_id
@@ -216,6 +216,8 @@ def import_video(
         UsageError: `out` exists, or an option makes no sense.
     """
     options = options or VideoImport()
+    given = {"video": video, "landmarks": landmarks, "masks": options.masks}
+    check_places({"out": out}, given, replaces=options.overwrite, makes_captures=True)
     _check_output(Path(out), options)
     call = _call(video, landmarks, out, options)
     source = drop_blank_frames(read_source(video, landmarks, options))
@@ -275,10 +277,14 @@ def drop_blank_frames(source: VideoSource) -> VideoSource:
     notice(f"warning: no hand is taken from frames of one colour: {bounded(wrong.tolist())}.")
     hands = {}
     for side, hand in source.hands.items():
-        hands[side] = replace(hand, detected=hand.detected & ~blank)
-        if not hands[side].detected.any():
-            said = f"the {side} hand is detected in frames of one colour only"
-            raise BadInput(said, where=source.video.path)
+        left = replace(hand, detected=hand.detected & ~blank)
+        if left.detected.any():
+            hands[side] = left
+        else:
+            notice(f"The {side} hand is in none of the other frames and is left out.")
+    if not hands:
+        problem = "a hand is detected in frames of one colour only"
+        raise BadInput(problem, where=source.video.path)
     return replace(source, hands=hands)
 
 

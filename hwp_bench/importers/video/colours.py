@@ -183,7 +183,8 @@ def to_srgb(frame: Any, colours: Colours, size: tuple[int, int]) -> np.ndarray:
         frame.color_range = 2 if colours.full else 1
     width, height = size
     same_size = (frame.width, frame.height) == size
-    if colours.plain and not (colours.full and colours.bits > 8):
+    # Red, green and blue need no matrix.
+    if colours.plain and not (colours.matrix and colours.full and colours.bits > 8):
         # Exact rounding moves ordinary video by one level, and would change every capture.
         flags = _bicubic(exact=colours.bits > 8 or not same_size)
         made = frame.reformat(width, height, "rgb24", None, None, flags, None, 2, threads=1)

@@ -376,7 +376,7 @@ class _Video:
 
     def packets(self) -> Iterator[Any]:
         """Packets of the frames that are shown, in the order of the file."""
-        for packet in self._container.demux(self._stream):
+        for packet in self._packets_of_file():
             if packet.size and not packet.is_discard:
                 yield packet
 

@@ -476,6 +476,9 @@ def match_outline(
     # Those near the outline, evenly thinned.
     rows, columns, inside = cells(pixels[candidates], own.shape)
     chosen = candidates[inside & (own[rows, columns] >= -_OUTLINE_WITHIN)]
+    # The other hand may cover all of them.
+    if len(chosen) == 0:
+        return Outline.nothing()
     if len(chosen) > _OUTLINE_COUNT:
         chosen = chosen[np.linspace(0, len(chosen) - 1, _OUTLINE_COUNT).astype(np.int64)]
     places = pixels[chosen].astype(np.float32)

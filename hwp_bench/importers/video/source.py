@@ -201,8 +201,20 @@ def read_source(
     _check_memory(windows)
     own = None if options.masks is None else read_masks(options.masks, info, indices, windows)
     endings: list[Reading] = []
+
+    def ended(found: Reading) -> None:
+        # A stride may select as many of another number.
+        if found.frames != total:
+            raise BadInput(
+                f"has {total} frames, the video has {found.frames}",
+                where=landmarks,
+                field="score",
+                remedy="Track every frame of exactly this video.",
+            )
+        endings.append(found)
+
     with progress("reading frames", len(indices)) as update:
-        images = read_images(info, options.frames, windows, update, endings.append)
+        images = read_images(info, options.frames, windows, update, ended)
     reading = endings[0] if endings else None
     if reading is not None:
         warn_of_damage(info, reading)

@@ -337,3 +337,12 @@ def test_dolby_vision_without_a_base_is_named(tmp_path: Path) -> None:
     path.write_bytes(content.replace(b"hev1", b"dvh1"))
     with pytest.raises(BadInput, match="Dolby Vision"):
         probe(path)
+
+
+def test_red_green_and_blue_of_more_than_eight_bits(tmp_path: Path) -> None:
+    one = np.array([640, 480, 400], np.uint16)
+    # Stored as green, blue, red.
+    planes = [np.full((48, 64), one[channel]) for channel in (1, 2, 0)]
+    path = write_samples(tmp_path / "a.mkv", [planes], "gbrp10le", "ffv1")
+    [(_, image)] = read_frames(probe(path), FrameRange())
+    assert np.abs(image[24, 32] - one / 1023 * 255).max() <= 1.0

@@ -57,6 +57,15 @@ def test_the_signed_distance_of_a_disc() -> None:
     np.testing.assert_allclose(field, truth, atol=0.75)
 
 
+def test_a_hand_that_another_covers_has_no_outline() -> None:
+    centre = np.array([96.0, 96.0])
+    vertices, faces = disc(centre, 40.0)
+    field = signed_distance(disc_mask(centre, 40.0))
+    found = match_outline(vertices, faces, np.zeros(0, dtype=np.int64), field, reach=8.0)
+    assert not found.normal.any()
+    assert not found.target.any()
+
+
 @pytest.mark.parametrize("level", [0, 255])
 def test_a_mask_without_outline_has_no_field(level: int) -> None:
     assert not signed_distance(np.full((64, 64), level, dtype=np.uint8)).any()

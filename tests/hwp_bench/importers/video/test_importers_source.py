@@ -26,6 +26,7 @@ from hwp_bench.cli.main import main
 from hwp_bench.importers.shared.landmarks import HandTracks, write_hand_tracks
 from hwp_bench.importers.video import VideoImport, import_video
 from hwp_bench.importers.video import api as pipeline
+from hwp_bench.importers.video.api import drop_blank_frames
 from hwp_bench.importers.video.decode import FrameRange, probe, read_frames, read_times
 from hwp_bench.importers.video.source import (
     VideoSource,
@@ -112,6 +113,28 @@ def test_landmarks_of_different_frames_are_told(source: VideoSource) -> None:
     assert said == ("`image` and `world` do not show the same hand in the same frames",)
 
 
+@pytest.mark.parametrize("less", [1, 4])
+def test_a_stride_hides_no_missing_frame(clip: SyntheticClip, tmp_path: Path, less: int) -> None:
+    count = FRAMES // 2 * 2  # even: one row less selects as many
+    video = write_video(tmp_path / "a.avi", [clip.picture(frame) for frame in range(count)])
+    few = write_landmarks(tmp_path / "a.npz", clip.landmarks.select(np.arange(count - less)))
+    with pytest.raises(BadInput, match=f"has {count - less} frames, the video has {count}"):
+        read_source(video, few, VideoImport(frames=FrameRange(stride=2)))
+
+
+def test_a_hand_in_black_frames_alone_is_left_out(source: VideoSource) -> None:
+    frames = source.images.frames.copy()
+    frames[:3] = 0
+    hand = source.hands["right"]
+    shown = np.arange(len(hand.detected)) < 3
+    hands = {"right": hand, "left": replace(hand, detected=shown)}
+    images = replace(source.images, frames=frames)
+    assert list(drop_blank_frames(replace(source, images=images, hands=hands)).hands) == ["right"]
+    alone = replace(source, images=images, hands={"left": hands["left"]})
+    with pytest.raises(BadInput, match="in frames of one colour only"):
+        drop_blank_frames(alone)
+
+
 def test_a_part_of_a_video_that_is_cut_off_is_imported(clip: SyntheticClip, tmp_path: Path) -> None:
     """Its frames are fewer than its packets and its header say. Oracle: decoding them."""
     images = [clip.picture(frame) for frame in range(FRAMES)]
@@ -123,7 +146,7 @@ def test_a_part_of_a_video_that_is_cut_off_is_imported(clip: SyntheticClip, tmp_
     info, stamps = probe(cut), read_times(cut)
     count = sum(1 for _ in read_frames(info, FrameRange()))
     assert stamps is not None
-    assert 10 < count < len(stamps) < info.stated_frames
+    assert 10 < count == len(stamps) < info.stated_frames
     options = VideoImport(frames=FrameRange(2, 9))
     tracked = write_landmarks(tmp_path / "a.npz", clip.landmarks.select(np.arange(count)))
     source = read_source(cut, tracked, options)

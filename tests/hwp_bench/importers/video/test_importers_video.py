@@ -325,14 +325,16 @@ def test_two_masks_of_a_frame_are_named(folder: Path, tmp_path: Path) -> None:
 
 
 def test_a_mask_of_another_size_is_named(folder: Path, tmp_path: Path) -> None:
+    masks = tmp_path / "masks"
+    masks.mkdir()
     for frame in range(FRAMES):
-        write_image(tmp_path / f"{frame}.png", np.zeros((24, 32), dtype=np.uint8))
+        write_image(masks / f"{frame}.png", np.zeros((24, 32), dtype=np.uint8))
     with pytest.raises(HwpError, match="32x24 pixels where 320x240"):
         import_video(
             folder / "hand.avi",
             folder / "hand.npz",
             tmp_path / "out",
-            VideoImport(masks=tmp_path, fit=QUICK),
+            VideoImport(masks=masks, fit=QUICK),
         )
 
 
