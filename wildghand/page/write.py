@@ -26,6 +26,7 @@ from wildghand.avatar import WildGHandAvatar, load_avatar
 from wildghand.avatar.avatar import InlinePicture
 from wildghand.avatar.render import shown_sides
 from wildghand.avatar.studio import REST, Pose
+from wildghand.export.splats import turned
 from wildghand.page.bake import (
     biases_content,
     hand_content,
@@ -95,7 +96,10 @@ def sample_poses(
         frames = [fitted[pick] for pick in evenly(len(fitted), settings.most_frames)]
         drawn = [fitted[pick] for pick in evenly(len(fitted), settings.clip_samples)]
         poses = {f: avatar.believed(capture.hand_poses(f)) for f in fitted}
-        start = start_of_clip(avatar, capture)
+        start, viewmat = start_of_clip(avatar, capture), capture.camera(fitted[0]).viewmat
+        if not np.array_equal(viewmat[:3, :3], np.eye(3)):
+            # The studio's camera looks along z, the clip's does not.
+            start = turned(avatar, start, viewmat[:3, :3].T, np.zeros(3))
         clip = {
             side: np.stack([start[side].pose, *(poses[frame][side].pose for frame in drawn)])
             for side in avatar.sides
@@ -103,7 +107,7 @@ def sample_poses(
         for side in avatar.sides:
             hands = [poses[frame][side] for frame in frames]
             motion[side] = np.stack([np.append(hand.pose.ravel(), hand.transl) for hand in hands])
-        viewmat, times = capture.camera(fitted[0]).viewmat, capture.info.frame_times()[frames]
+        times = capture.info.frame_times()[frames]
         lasts = np.diff(times, append=times[-1] + 1.0 / capture.info.fps)
     learnt = {
         side: np.concatenate([poses, _random(avatar, side, poses, settings.random_samples, random)])

@@ -435,6 +435,22 @@ def test_frames_are_played_at_the_pace_at_which_they_were_recorded(fitted) -> No
         assert samples.shown[-1] == pytest.approx(1 / 30)
 
 
+def test_a_turned_camera_opens_on_the_same_side(fitted) -> None:
+    """As the cameras of InterHand2.6M are turned in their world."""
+    avatar, capture = fitted
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_euler("yx", [90.0, 20.0], degrees=True).as_matrix()
+    cameras = replace(capture.cameras, viewmats=turn @ capture.cameras.viewmats)
+    moved = Capture(capture.root, capture.info, capture.hands, cameras)
+
+    def seen(given: Capture) -> np.ndarray:
+        made = sample_poses(avatar, given, SMALL)
+        wrist = Rotation.from_rotvec(made.start["right"].pose[0]).as_matrix()
+        return made.viewmat[:3, :3] @ wrist
+
+    np.testing.assert_allclose(seen(moved), seen(capture), atol=1e-6)
+
+
 def test_another_import_of_the_same_id_is_refused(fitted) -> None:
     """As a second `wildghand fit VIDEO` leaves it that was stopped in its fit."""
     avatar, capture = fitted
