@@ -266,9 +266,12 @@ def _check_names(changes: Mapping[str, Any], known: Mapping[str, Any]) -> None:
 
 def _without_idle_parts(settings: WildGHandSettings) -> WildGHandSettings:
     """Switch off what has no effect in these settings."""
-    dpd, pao, prepass = settings.dpd, settings.pao, settings.prepass
+    dpd, pao, prepass, terms = settings.dpd, settings.pao, settings.prepass, settings.terms
+    # The authors' code compares with black wherever the hand is not seen.
+    black = pao.enabled and pao.variant == "released"
     return dataclasses.replace(
         settings,
+        terms=dataclasses.replace(terms, leave_hidden=terms.leave_hidden and not black),
         dpd=dataclasses.replace(
             dpd,
             additions=dpd.enabled and dpd.additions,

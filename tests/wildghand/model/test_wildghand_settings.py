@@ -201,3 +201,9 @@ def test_settings_are_few_and_each_number_has_a_range() -> None:
 @pytest.mark.parametrize("name", ["wildghand", "network-scratch"])
 def test_the_manifest_lists_every_setting(name: str) -> None:
     assert list(read_manifest(find_method(name)).settings) == ["mode", *EVERY]
+
+
+def test_hidden_skin_is_off_where_released_weights_overrule_it() -> None:
+    assert not read_settings({"pao.variant": "released"}).terms.leave_hidden
+    assert read_settings({"pao.variant": "released", "pao.enabled": False}).terms.leave_hidden
+    assert read_settings({}).terms.leave_hidden
