@@ -12,7 +12,7 @@ import numpy as np
 from hwp_bench.base.colors import srgb_to_linear
 from hwp_bench.base.errors import ShapeMismatch
 from hwp_bench.capture import Cameras, Capture
-from hwp_bench.hands import HandParameters, HandTemplate, load_template
+from hwp_bench.hands import HandParameters, HandTemplate
 from hwp_bench.hands.anchors import Footprint
 from wildghand.prepass.intensity import HIGHEST, LOWEST, IntensityModel, log_light_table
 
@@ -75,14 +75,13 @@ def capture_input(
     """
     numbers = indices.tolist() if frames is None else frames
     images, masks = zip(*((capture.frame(k), capture.mask(k)) for k in numbers), strict=True)
-    source = capture.info.hand_model.source
     return PrepassInput(
         indices=indices,
         images=np.stack(images),
         masks=np.stack(masks),
         hands=capture.hands,
         cameras=capture.cameras,
-        templates={side: load_template(source, side) for side in capture.info.sides},
+        templates={side: capture.template(side) for side in capture.info.sides},
     )
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,10 +12,12 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from hwp_bench.base.colors import linear_to_srgb
+from hwp_bench.base.errors import BadInput
+from hwp_bench.capture import Capture
 from wildghand.prepass.assessment import PrepassSettings, densest, excess, normal_value
 from wildghand.prepass.intensity import IntensitySamples, fit_intensity, shading_basis
 from wildghand.prepass.judge import LEAST_FRAMES, clean_probability, clip_tolerance, evidence
-from wildghand.prepass.measurements import border_width, misplacement
+from wildghand.prepass.measurements import border_width, capture_input, misplacement
 
 
 def test_normal_values_of_a_normal_distribution() -> None:
@@ -133,3 +138,14 @@ def test_a_pale_palm_is_not_another_light(lit: bool) -> None:
     )
     model = fit_intensity(samples, normals)
     np.testing.assert_allclose(model.gains, gains, atol=0.25)
+
+
+def test_a_capture_of_another_edition_of_the_hand_is_refused(
+    make_painted: Callable[..., Capture],
+) -> None:
+    capture = make_painted()
+    model = replace(capture.info.hand_model, digest="0" * 64)
+    info = replace(capture.info, hand_model=model)
+    other = Capture(capture.root, info, capture.hands, capture.cameras)
+    with pytest.raises(BadInput, match="another edition"):
+        capture_input(other, np.arange(2))
