@@ -63,13 +63,13 @@ _REGISTER = """examples:
 
 For the maintainers of a board. The names and titles of methods that ship with the toolkit belong to
 it: an entry that carries one is left out, and `check` refuses it, until its digest is listed in
-names.json, next to the folder of entries. `leaderboard add` lists what it adds.
+names.json, next to the folder of entries. `add` lists what it adds.
 """
 _CONFIRM = """examples:
   hwp-bench dev leaderboard confirm runs/mine-mini --checked-by maintainers
   hwp-bench dev leaderboard confirm runs/field/mini --checked-by maintainers
   hwp-bench dev leaderboard confirm runs/second-run --checked-by maintainers --tolerance 0.05
-  hwp-bench dev leaderboard confirm runs/second --checked-by maintainers --entry mine-mini-0123abcd
+  hwp-bench dev leaderboard confirm runs/second --checked-by me --entry mine-mini-seed0-0123abcd
 
 Checks are never removed. Where checks of an entry contradict each other, the one that differs
 counts until a new check overrules it by name (--overrules, --reason).

@@ -65,7 +65,7 @@ def _add_fit(parser: argparse.ArgumentParser) -> None:
     add("source", type=Path, metavar="VIDEO|CAPTURE", help="capture folder or video file")
     out = "avatar folder to make (default for a video: VIDEO_avatar)"
     add("-o", "--out", type=Path, help=out)
-    quick = "about half of the time: fewer frames, Gaussians, steps"
+    quick = "fewer Gaussians and steps, and frames of a video: half of its time"
     add("--quick", action="store_true", help=quick)
     sides = "the hands in a video (default: auto, one or both, as it shows)"
     add("--side", choices=("auto", "right", "left"), help=sides)

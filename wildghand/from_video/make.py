@@ -225,7 +225,7 @@ def fit(
         source: a video, a capture, or a capture's folder.
         out: the avatar folder to make. None writes nothing for a capture; for a video it is
             `hand_avatar` next to `hand.mp4`.
-        quick: an avatar in about half of the time: fewer frames of a video, Gaussians and steps.
+        quick: fewer Gaussians and steps, and frames of a video: about half of its time.
         settings: settings that override the defaults, such as `{"gaussians": 5000}`; the fields
             of `WildGHandSettings`, dotted for those of a component.
         seconds: limit of the fit, s.
