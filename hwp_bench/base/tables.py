@@ -159,7 +159,7 @@ def _markdown_text(text: str) -> str:
 
 
 def to_latex(table: Table) -> str:
-    """Return a booktabs table: best bold, second underlined."""
+    """Return a booktabs table: best bold, second underlined; check marks need amssymb."""
     marks = {0: r"\textbf{%s}", 1: r"\underline{%s}", None: "%s"}
 
     def cell(row: int, column: int) -> str:

@@ -265,7 +265,7 @@ def _mean(values: Sequence[float | None]) -> float | None:
 def budget_text(budget: Mapping[str, Any]) -> str:
     """Return a budget in words: `60 s`, `60 s, 100,000 steps` or `no limit`."""
     units = {"seconds": "s", "steps": "steps"}
-    parts = [f"{budget[name]:,g} {unit}" for name, unit in units.items() if budget.get(name)]
+    parts = [f"{budget[name]:,.15g} {unit}" for name, unit in units.items() if budget.get(name)]
     return ", ".join(parts) or "no limit"
 
 

@@ -323,9 +323,9 @@ def entry_name(results: Results, content: str | None = None) -> str:
     """Return the name of an entry: method, suite, budget, seed, and part of its digest."""
     parts = [results.method.name, results.suite]
     if results.budget.get("seconds"):
-        parts.append(f"{results.budget['seconds']:g}s")
+        parts.append(f"{results.budget['seconds']:.15g}s")
     if results.budget.get("steps"):
-        parts.append(f"{results.budget['steps']:g}steps")
+        parts.append(f"{results.budget['steps']:.15g}steps")
     parts += [f"seed{results.seed}", (content or digest(results))[:8]]
     return re.sub(r"[^a-z0-9.]+", "-", "-".join(parts).lower()).strip("-.")
 

@@ -15,6 +15,7 @@ from markupsafe import Markup
 
 from hwp_bench.analysis.cost import analyse_cost
 from hwp_bench.analysis.pairing import group_runs
+from hwp_bench.base.console import notice
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import atomic_folder, canonical_json
 from hwp_bench.leaderboard.board import (
@@ -204,6 +205,10 @@ def build_site(
     if folder.is_dir() and any(folder.iterdir()) and not (folder / "board.js").is_file():
         raise UsageError("holds something else than a leaderboard", where=folder, field="-o")
     folders = {digest(source.results): source.folder for source in results_folders}
+    known = {digest(entry.results) for entry in entries}
+    for source in results_folders:
+        if digest(source.results) not in known:
+            notice(f"left out: {source.folder} is of no entry")
     captures = open_captures_of([source.results for source in results_folders])
     with atomic_folder(folder, overwrite=True) as temporary:
         rows = shown_rows(entries)

@@ -137,7 +137,7 @@ def provenance(result: Results) -> dict[str, str]:
     environment = result.environment
     packages = environment.get("packages", {})
     devices = sorted({capture.device for capture in result.captures if capture.device})
-    limits = [f"{value:g} {name}" for name, value in result.budget.items() if value]
+    limits = [f"{value:.15g} {name}" for name, value in result.budget.items() if value]
     return {
         "Method": f"{result.method.title} ({result.method.name}), preset {result.method.preset}",
         "Settings": ", ".join(f"{k} = {v}" for k, v in result.method.settings.items()) or "none",

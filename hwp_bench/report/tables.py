@@ -224,7 +224,7 @@ _TELLING: tuple[Callable[[Results], str], ...] = (
     lambda result: result.method.preset,
     lambda result: f"{result.frames} frames",
     lambda result: (
-        ", ".join(f"{value:g} {name}" for name, value in result.budget.items() if value)
+        ", ".join(f"{value:.15g} {name}" for name, value in result.budget.items() if value)
         or "no limit"
     ),
     _seed,

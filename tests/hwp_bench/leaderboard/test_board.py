@@ -69,6 +69,13 @@ def test_another_budget_is_another_row() -> None:
     assert [row.seeds for row in board_rows(map(make_entry, (first, longer)))] == [(0,), (1,)]
 
 
+def test_a_large_budget_is_written_out() -> None:
+    made = make_entry(replace(results("mine", 24.0, 0), budget={"steps": 1_000_001}))
+    (row,) = board_rows([made])
+    assert row.budget == "1,000,001 steps"
+    assert "-1000001steps-" in made.name
+
+
 def test_an_incomplete_entry_and_a_second_one_of_a_seed_stand_alone() -> None:
     whole = make_entry(results("mine", 24.0, 0))
     short = make_entry(replace(results("mine", 24.0, 1), captures=whole.results.captures[1:]))

@@ -627,6 +627,12 @@ def test_the_plot_of_a_table_names_every_method_and_the_front(
     assert plot["bands"].startswith("shaded bands" if bands else "no intervals")
 
 
+def test_results_of_no_entry_are_named(tmp_path: Path, capsys) -> None:
+    other = ResultsSource(results("other"), tmp_path / "runs")
+    build_site(tmp_path / "site", [make_entry(results("plain"))], [other])
+    assert f"left out: {tmp_path / 'runs'} is of no entry" in capsys.readouterr().err
+
+
 def test_the_plot_says_that_machines_differ_and_which_fits_it_lacks() -> None:
     entries = []
     for number, processor in enumerate(("slow", "fast")):
