@@ -410,6 +410,8 @@ def new_bars() -> Progress:
         TimeElapsedColumn(),
         TextColumn("elapsed{task.fields[left]}", markup=False),
         console=Console(stderr=True),
+        # What is printed meanwhile stands above the bars only where both are on the screen.
+        redirect_stdout=on_terminal(sys.stdout),
     )
 
 

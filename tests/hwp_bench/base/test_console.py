@@ -137,3 +137,12 @@ def test_on_a_terminal_one_display_shows_stage_and_steps(
         assert [task.description for task in view._bars.tasks] == ["[2/4] Fitting [bold]"]
     assert OUTER.get() is None
     assert "Fitting [bold]" in capsys.readouterr().err
+
+
+def test_what_is_printed_while_a_bar_is_shown_stays_on_standard_output(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    for name in track("ab", "checking"):
+        print(name)
+    assert capsys.readouterr().out == "a\nb\n"
