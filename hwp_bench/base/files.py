@@ -47,6 +47,7 @@ def atomic_write(
 ) -> Path:
     """Write a file so that a reader sees the old content or the new one, never a part."""
     path = Path(path)
+    refuse_special(path)
     raw = data.encode() if isinstance(data, str) else data
     temporary: Path | None = None
     try:
@@ -56,16 +57,41 @@ def atomic_write(
         with open(temporary, "xb") as stream:
             stream.write(raw)
         _name_file(temporary, path, overwrite)
-    except OSError as error:
+    except BaseException as error:
         if temporary is not None:
             with contextlib.suppress(OSError):
                 os.unlink(temporary)
+        if not isinstance(error, OSError):
+            raise
         if isinstance(error, FileExistsError) and not overwrite:
             raise _exists(path, flag) from error
         raise HwpError(
             f"cannot be written ({reason_of(error)})", where=path, remedy=_room(path)
         ) from error
     return path
+
+
+def refuse_special(path: Path) -> None:
+    """Refuse a device or a pipe as an output: whole files are renamed over what is there."""
+    with contextlib.suppress(OSError):
+        mode = path.stat().st_mode
+        # What lies there may lead to a file, as /dev/stdout does.
+        system = path.absolute().parent == Path("/dev")
+        if system or not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+            raise UsageError("is a device or a pipe", where=path, remedy="Name a file.")
+
+
+def _refuse_mounted(path: Path) -> None:
+    if os.path.ismount(os.path.realpath(path)):
+        raise _mounted(path)
+
+
+def _mounted(path: Path) -> UsageError:
+    return UsageError(
+        "is a mounted disc or volume, which no folder can replace",
+        where=path,
+        remedy="Name a folder inside of it.",
+    )
 
 
 def _room(path: Path) -> str:
@@ -123,6 +149,7 @@ def refuse_existing(
 ) -> None:
     """Refuse to make a folder where something is; `flag` is the option that replaces it."""
     path = Path(path)
+    _refuse_mounted(path)
     if path.is_file():
         raise _exists(path, "")  # A folder does not replace a file.
     if path.is_dir() and any(path.iterdir()) and not overwrite:
@@ -139,6 +166,7 @@ def refuse_other(path: str | os.PathLike[str], what: str, is_one: Callable[[Path
         is_one: whether a folder that is not empty is one.
     """
     path = Path(path)
+    _refuse_mounted(path)
     if path.is_file():
         raise UsageError("is a file", where=path, remedy="Name a folder.")
     if path.is_dir() and any(path.iterdir()) and not is_one(path):
@@ -239,6 +267,8 @@ def _take_name(temporary: Path, path: Path, overwrite: bool, flag: str) -> None:
                 os.rename(temporary, path)
                 return
             except OSError as error:
+                if error.errno in (errno.EBUSY, errno.EXDEV):  # mounted from the same file system
+                    raise _mounted(path) from error
                 if error.errno not in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):
                     raise
                 if not overwrite or not path.is_dir() or len(retired) >= _MOST_RETIRED:

@@ -29,7 +29,7 @@ from hwp_bench.base.errors import (
     check_name,
     reason_of,
 )
-from hwp_bench.base.files import atomic_write, check_is_file
+from hwp_bench.base.files import atomic_write, check_is_file, refuse_special
 
 #: Largest image that is decoded, in pixels: a 300 byte PNG can ask for gigabytes.
 MAX_PIXELS = 64 * 1024 * 1024
@@ -181,14 +181,17 @@ def write_image(path: str | os.PathLike[str], pixels: np.ndarray) -> Path:
     spec.attribute("oiio:ColorSpace", "sRGB")
     spec.attribute("png:compressionLevel", PNG_LEVEL)
     spec.attribute("oiio:UnassociatedAlpha", 1)
-    written = output.open(os.fspath(temporary), spec) and output.write_image(
-        np.ascontiguousarray(array)
-    )
-    problem = " ".join(output.geterror().split())
-    if not (output.close() and written and _is_whole(temporary)):
+    try:
+        written = output.open(os.fspath(temporary), spec) and output.write_image(
+            np.ascontiguousarray(array)
+        )
+        problem = " ".join(output.geterror().split())
+        if not (output.close() and written and _is_whole(temporary)):
+            raise HwpError(f"cannot be written ({problem or 'no space or permission'})", where=path)
+        os.replace(temporary, path)
+    except BaseException:
         temporary.unlink(missing_ok=True)
-        raise HwpError(f"cannot be written ({problem or 'no space or permission'})", where=path)
-    os.replace(temporary, path)
+        raise
     return path
 
 
@@ -309,6 +312,7 @@ def write_movie(
         times: when each frame is shown, s, rising from 0, where the steps between them differ.
     """
     path = Path(path)
+    refuse_special(path)
     av = check_encoder()
     partial = path.with_name(f".{os.getpid()}.{path.stem}.mp4")
     try:

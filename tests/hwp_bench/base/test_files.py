@@ -9,12 +9,14 @@ import contextlib
 import errno
 import json
 import os
+import stat
 import subprocess
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from hwp_bench.base.errors import BadInput, HwpError, UsageError
@@ -23,9 +25,11 @@ from hwp_bench.base.files import (
     atomic_write,
     inside,
     read_json,
+    refuse_other,
     sha256_json,
     write_json,
 )
+from hwp_bench.base.images import write_image
 
 
 def test_a_file_is_replaced_whole_and_leaves_nothing_beside_it(tmp_path: Path) -> None:
@@ -321,4 +325,41 @@ def test_an_image_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
     lines = done.stdout.splitlines()
     assert len(lines) == 12
     assert all("cannot be written" in line for line in lines)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_mounted_volume_is_refused_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    monkeypatch.setattr("os.path.ismount", lambda path: Path(path) == out)
+    with pytest.raises(UsageError, match="Name a folder inside"), atomic_folder(out):
+        pytest.fail("the work began")
+    with pytest.raises(UsageError, match="mounted"):
+        refuse_other(out, "a capture", lambda folder: True)
+
+
+def test_a_pipe_is_not_replaced(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "out").symlink_to("pipe")
+    for name in ("pipe", "out"):
+        with pytest.raises(UsageError, match="a device or a pipe"):
+            atomic_write(tmp_path / name, "x")
+    assert stat.S_ISFIFO((tmp_path / "pipe").stat().st_mode)
+    assert (tmp_path / "out").is_symlink()
+
+
+def stop(*given: object) -> None:
+    raise KeyboardInterrupt
+
+
+def test_an_interrupted_write_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "replace", stop)
+    with pytest.raises(KeyboardInterrupt):
+        atomic_write(tmp_path / "a.txt", "x")
+    with pytest.raises(KeyboardInterrupt):
+        write_image(tmp_path / "a.png", np.zeros((4, 4, 3), np.uint8))
     assert list(tmp_path.iterdir()) == []
