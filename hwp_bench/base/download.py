@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import urllib.request
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import IO
 
@@ -32,24 +32,24 @@ def open_address(address: str) -> IO[bytes]:
     return opened
 
 
+class NotAvailable(HwpError):
+    """An address, or a folder in its place, does not give a file."""
+
+
 def download(file: Pinned, target: IO[bytes], opener: Opener | None = None) -> None:
     """Copy what lies at an address into an open file.
 
     Raises:
-        HwpError: it cannot be downloaded.
+        NotAvailable: it cannot be downloaded.
+        OSError: the open file cannot be written.
         BadInput: it has another content than the pinned one.
     """
     digest, size = hashlib.sha256(), 0
-    try:
-        with (opener or open_address)(file.name) as stream:
-            while size <= file.size and (piece := stream.read(1 << 20)):
-                target.write(piece)
-                digest.update(piece)
-                size += len(piece)
-    # urllib raises errors of sockets, TLS, HTTP and addresses.
-    except Exception as error:
-        reason = str(error).strip().split("\n")[0][:200] or type(error).__name__
-        raise HwpError(f"cannot be downloaded ({reason})", where=file.name) from error
+    for piece in _pieces(file, opener):
+        # A target that cannot be written is no fault of the network.
+        target.write(piece)
+        digest.update(piece)
+        size += len(piece)
     if size != file.size or digest.hexdigest() != file.sha256:
         raise BadInput(
             f"the download has {size} bytes and SHA-256 {digest.hexdigest()[:16]}, expected "
@@ -57,3 +57,17 @@ def download(file: Pinned, target: IO[bytes], opener: Opener | None = None) -> N
             where=file.name,
             remedy="Try again; if it differs again, do not trust it.",
         )
+
+
+def _pieces(file: Pinned, opener: Opener | None) -> Iterator[bytes]:
+    """What lies at an address, up to a piece more than it may have."""
+    size = 0
+    try:
+        with (opener or open_address)(file.name) as stream:
+            while size <= file.size and (piece := stream.read(1 << 20)):
+                size += len(piece)
+                yield piece
+    # urllib raises errors of sockets, TLS, HTTP and addresses.
+    except Exception as error:
+        reason = str(error).strip().split("\n")[0][:200] or type(error).__name__
+        raise NotAvailable(f"cannot be downloaded ({reason})", where=file.name) from error

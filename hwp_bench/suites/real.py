@@ -18,7 +18,7 @@ from typing import Annotated, ClassVar
 from msgspec import Meta
 
 from hwp_bench.base.console import notice
-from hwp_bench.base.download import Pinned, download
+from hwp_bench.base.download import NotAvailable, Pinned, download
 from hwp_bench.base.errors import BadInput, HwpError, UsageError
 from hwp_bench.base.files import cache_root, disc_errors, sha256_file, temporary_name
 from hwp_bench.base.folders import exclusive
@@ -126,7 +126,7 @@ class RealClip:
     def _in_folder(self, folder: Path) -> Path:
         found = next((path for path in sorted(folder.iterdir()) if self._is(path)), None)
         if found is None:
-            raise HwpError(f"holds no file of {self.id} (SHA-256 {self.sha256})", where=folder)
+            raise NotAvailable(f"holds no file of {self.id} (SHA-256 {self.sha256})", where=folder)
         return found
 
     def _is(self, path: Path) -> bool:
@@ -205,7 +205,7 @@ def ensure_clips(name: str, folder: Path | None = None) -> tuple[list[Path], Map
             continue
         try:
             video = clip.fetch(folder)
-        except HwpError as error:
+        except (NotAvailable, BadInput) as error:
             missing[clip.id] = str(error)
             notice(f"{name} without {clip.id}: {error}")
             continue

@@ -24,9 +24,9 @@ from typing import IO, Any
 
 import numpy as np
 
-from hwp_bench.base.download import Opener, Pinned, download
+from hwp_bench.base.download import NotAvailable, Opener, Pinned, download
 from hwp_bench.base.errors import BadInput, HwpError
-from hwp_bench.base.files import atomic_write, cache_root, check_is_file
+from hwp_bench.base.files import atomic_write, cache_root, check_is_file, disc_errors
 from hwp_bench.base.packages import import_extra
 
 # --- Rotated regions of an image
@@ -404,12 +404,10 @@ def fetch_models(*, opener: Opener | None = None, wheel: Pinned = WHEEL) -> Path
         BadInput: it has another content than the pinned one.
     """
     folder = models_folder()
-    with tempfile.TemporaryFile() as stream:
+    with disc_errors(tempfile.gettempdir()), tempfile.TemporaryFile() as stream:
         try:
             download(wheel, stream, opener)
-        except BadInput:
-            raise
-        except HwpError as error:
+        except NotAvailable as error:
             raise HwpError(
                 f"{error.problem}, and the networks of the hand tracker are not in the cache",
                 where=folder,

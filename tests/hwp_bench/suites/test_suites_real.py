@@ -6,10 +6,13 @@ in for the tracker's.
 
 from __future__ import annotations
 
+import errno
 import functools
 import hashlib
 import http.server
+import io
 import json
+import os
 import re
 import threading
 import urllib.request
@@ -320,3 +323,20 @@ def test_the_board_knows_a_clip_by_what_it_is_imported_from() -> None:
     # A suite apart, beside the simulated ones.
     both = board_tables([one, make_entry(complete_results("mine"))])
     assert [re.findall("real-1|smoke", table.caption) for table in both] == [["smoke"], ["real-1"]]
+
+
+def test_a_full_disc_is_not_taken_for_a_missing_clip(
+    tracked: list[str], videos: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Full(io.BytesIO):
+        def write(self, data: Any) -> int:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    honest = real.download
+
+    def download(file: Any, target: Any, opener: Any = None) -> None:
+        honest(file, Full(), opener)
+
+    monkeypatch.setattr(real, "download", download)
+    with pytest.raises(HwpError, match=r"cannot be written \(No space left"):
+        ensure_clips("real-1", videos)
