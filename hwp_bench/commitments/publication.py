@@ -24,6 +24,7 @@ from hwp_bench.base.files import (
     atomic_folder,
     canonical_json,
     read_json,
+    refuse_existing,
     write_json,
 )
 from hwp_bench.base.images import pixel_digest
@@ -121,6 +122,7 @@ def publish(
     """
     if not captures:
         raise UsageError("no capture is given", field="CAPTURES")
+    refuse_existing(out)
     salt = salt or secrets.token_hex(SALT_BYTES)
     pairs = open_captures(captures, splits)
     for capture, split in pairs:
@@ -129,6 +131,8 @@ def publish(
             _refuse_unscorable(capture.free_view, range(len(capture.free_view)))
     commitments = [commitment(target_content(*pair), salt) for pair in pairs]
     with atomic_folder(out) as root:
+        # From the start: a process that is killed leaves the folder as it is.
+        (root / SEALED).mkdir(mode=0o700)
         for capture, split in pairs:
             name = capture.info.id
             write_request(root / PUBLIC / name, _without_place(capture), split, RunSettings({}))
@@ -143,7 +147,6 @@ def publish(
         write_json(root / SEALED / KEY, {"schema": SEALED_SCHEMA, "salt": salt, **common})
         if describe is not None:
             describe(root / PUBLIC, joint)
-        os.chmod(root / SEALED, 0o700)
     folder = Path(out)
     return Publication(
         folder / PUBLIC, folder / SEALED, joint, tuple(capture.info.id for capture, _ in pairs)

@@ -82,6 +82,26 @@ def test_a_test_frame_that_cannot_be_scored_is_not_published(
         publish([tmp_path / "empty"], tmp_path / "publication")
 
 
+def test_the_sealed_part_is_closed_before_anything_is_in_it(
+    captures: list[Capture], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from hwp_bench.commitments import publication as parts
+
+    honest, modes = parts._copy_sealed, []
+
+    def look(capture: Capture, target: Path) -> None:
+        honest(capture, target)
+        modes.append(target.parent.stat().st_mode & 0o777)
+
+    monkeypatch.setattr(parts, "_copy_sealed", look)
+    publish([captures[0].root], tmp_path / "out")
+    assert modes == [0o700]
+    # What is there is refused before every image is read.
+    monkeypatch.setattr(parts, "target_content", lambda *_: pytest.fail("read"))
+    with pytest.raises(UsageError, match="exists already"):
+        publish([captures[0].root], tmp_path / "out")
+
+
 def test_of_two_publications_at_once_one_is_told_and_no_salt_is_lost(
     captures: list[Capture], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
