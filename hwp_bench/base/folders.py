@@ -29,7 +29,8 @@ def exclusive(folder: str | os.PathLike[str], *, wait: bool = False) -> Iterator
     from filelock import FileLock, Timeout
 
     folder = Path(folder)
-    file = folder.with_name(f"{folder.name}.lock") if wait else folder / LOCK
+    # Hidden: it stays next to captures, among which `captures/*` would find it.
+    file = folder.with_name(f".{folder.name.lstrip('.')}.lock") if wait else folder / LOCK
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         file.open("a").close()

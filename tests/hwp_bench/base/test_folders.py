@@ -80,7 +80,7 @@ def test_whoever_waits_is_told_so_and_goes_on_when_the_holder_is_gone(
         assert holder.wait() == 0
     holder.stdout.close()
     assert "Waiting for another process that makes capture" in capsys.readouterr().err
-    assert {item.name for item in tmp_path.iterdir()} == {"capture.lock"}
+    assert {item.name for item in tmp_path.iterdir()} == {".capture.lock"}
     with exclusive(out, wait=True):
         assert capsys.readouterr().err == ""
 

@@ -16,6 +16,7 @@ from hwp_bench.base.errors import UsageError
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.sim.effects import plan_frame
 from hwp_bench.sim.produce.capture import (
+    SuiteItem,
     ensure_suite,
     frame_file,
     render_capture,
@@ -146,6 +147,13 @@ def test_a_capture_that_was_made_while_a_render_waited_is_not_rendered_again(
     with pytest.raises(UsageError, match="exists"):
         render_capture(make_scene(), out, frame_count=FRAMES, size=SIZE, workers=1, free_view=False)
     assert [path.name for path in tmp_path.iterdir()] == ["same"]
+
+
+def test_next_to_the_captures_of_a_suite_no_visible_file_stays(
+    make_scene: SceneMaker, tmp_path: Path
+) -> None:
+    ensure_suite([SuiteItem(make_scene(), 10, 32)], tmp_path, 1, free_view=False)
+    assert [path.is_dir() for path in tmp_path.glob("[!.]*")] == [True]
 
 
 def test_refusals(rendered: Path, make_scene: SceneMaker, tmp_path: Path) -> None:
