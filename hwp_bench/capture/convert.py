@@ -13,7 +13,7 @@ import trimesh
 
 from hwp_bench.base.errors import ShapeMismatch, UsageError
 from hwp_bench.base.files import atomic_write
-from hwp_bench.capture.folder import Capture, identify_hand_model, rewrite_capture
+from hwp_bench.capture.folder import Capture, identify_hand_model, refuse_taken, rewrite_capture
 from hwp_bench.capture.schema import CaptureInfo
 from hwp_bench.hands.anchors import to_trimesh
 from hwp_bench.hands.fitting import FitTargets, fit_hand
@@ -100,6 +100,7 @@ def convert_capture(
 
     Returned are the errors of the capture. Those of its free-view clip stand in the clip.
     """
+    refuse_taken(out, overwrite=overwrite)
     clip = capture.free_view
     info, hands, errors = _converted(capture, source)
     # An avatar has one shape, so that the clip has that of the capture.

@@ -296,6 +296,7 @@ def _add_track(parser: argparse.ArgumentParser) -> None:
 
 
 def _track(args: argparse.Namespace) -> int:
+    from hwp_bench.importers.video.api import check_sheet
     from hwp_bench.tracking import TrackerSettings, fetch_models, track_video
 
     if args.fetch:
@@ -307,6 +308,8 @@ def _track(args: argparse.Namespace) -> int:
     out = args.out or args.video.with_suffix(".npz")
     outputs = {"--out": out, "--sheet": args.sheet}
     check_places(outputs, {"VIDEO": args.video, "--model": args.model})
+    if args.sheet is not None:
+        check_sheet(args.sheet)
     least = args.min_score
     tracked = track_video(
         args.video,

@@ -248,7 +248,7 @@ def read_finished_import(
     if not facts or facts.pop("call", None) != _call(video, landmarks, out, options):
         return None
     if options.sheet is not None and not options.sheet.exists():
-        _check_sheet(options.sheet)
+        check_sheet(options.sheet)
         write_image(options.sheet, read_rgb(Path(out) / EXTRA / SHEET_NAME))
     return facts
 
@@ -423,10 +423,11 @@ def _check_output(out: Path, options: VideoImport) -> None:
     refuse_taken(out, overwrite=options.overwrite)
     check_id(options.capture_id(out), os.fspath(out))
     if options.sheet is not None:
-        _check_sheet(options.sheet)
+        check_sheet(options.sheet)
 
 
-def _check_sheet(sheet: Path) -> None:
+def check_sheet(sheet: Path) -> None:
+    """Refuse a place that no sheet can be written to."""
     if sheet.suffix.lower() not in SHEET_KINDS:
         kinds = ", ".join(SHEET_KINDS)
         raise UsageError(f"must end in one of {kinds}", where=sheet, field="--sheet")
