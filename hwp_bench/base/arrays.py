@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 MAX_NPZ_BYTES = 1024 * 1024 * 1024
 #: Most arrays of a file: each takes some 0.1 ms to read, however small it is.
 MAX_MEMBERS = 10_000
+#: Largest directory of an archive, bytes: that of so many arrays has less than a tenth of it.
+MAX_DIRECTORY = 8 << 20
 
 
 def read_npz(
@@ -32,6 +34,7 @@ def read_npz(
     path = Path(path)
     check_is_file(path)
     try:
+        _check_directory(path)
         with zipfile.ZipFile(path) as archive:
             members = archive.infolist()
             unpacked = sum(item.file_size for item in members)
@@ -54,6 +57,18 @@ def read_npz(
             where=path,
             remedy="It must be an .npz of plain arrays.",
         ) from error
+
+
+def _check_directory(path: Path) -> None:
+    """Refuse a directory that is too large, before zipfile makes an object of each entry."""
+    with path.open("rb") as stream:
+        stream.seek(max(0, path.stat().st_size - 22 - 65535))
+        tail = stream.read()
+    end = len(tail) - 22  # where zipfile looks first: there is no comment
+    if tail[end : end + 4] != b"PK\5\6" or tail[-2:] != b"\0\0":
+        end = tail.rfind(b"PK\5\6")
+    if end >= 0 and int.from_bytes(tail[end + 12 : end + 16], "little") > MAX_DIRECTORY:
+        raise BadInput(f"holds more than {MAX_MEMBERS:,} arrays, or one twice", where=path)
 
 
 def _member(archive: zipfile.ZipFile, item: zipfile.ZipInfo) -> np.ndarray:

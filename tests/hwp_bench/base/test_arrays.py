@@ -144,3 +144,14 @@ def test_one_is_the_first_and_few_are_all() -> None:
     assert evenly(7, 1).tolist() == [0]
     assert evenly(4, 9).tolist() == [0, 1, 2, 3]
     assert evenly(9, 3).tolist() == [0, 4, 8]
+
+
+def test_a_directory_of_very_many_entries_is_refused_unread(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    count, file = 300_000, tmp_path / "many.npz"
+    end = b"PK\5\6" + bytes(4) + b"\xff\xff" * 2 + (46 * count).to_bytes(4, "little") + bytes(6)
+    file.write_bytes((b"PK\1\2" + bytes(42)) * count + end)
+    monkeypatch.setattr(zipfile, "ZipInfo", lambda *_: pytest.fail("an entry was read"))
+    with pytest.raises(BadInput, match="more than 10,000 arrays"):
+        read_npz(file)
