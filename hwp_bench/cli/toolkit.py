@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 from collections.abc import Sequence
 from dataclasses import replace
@@ -271,7 +272,7 @@ def _info(args: argparse.Namespace) -> int:
         "memory": os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
         "gpu": _graphics(),
         "cache": _from_home(folder),
-        "cache_size": sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()),
+        "cache_size": _size_of(folder),
         "tracker": _tracker(),
         "sandbox": "available" if refused is None else f"not available ({refused})",
     }
@@ -302,6 +303,16 @@ def _info(args: argparse.Namespace) -> int:
     return 0 if passed else 1
 
 
+def _size_of(folder: Path) -> int:
+    """Bytes of the files in a folder in which others may write and remove meanwhile."""
+    total = 0
+    for place, _, names in os.walk(folder):
+        for name in names:
+            with contextlib.suppress(OSError):
+                total += os.stat(os.path.join(place, name)).st_size
+    return total
+
+
 def _graphics() -> str:
     import torch
 
@@ -310,7 +321,10 @@ def _graphics() -> str:
 
 def _from_home(path: Path) -> str:
     """Return a path that does not say who the user is."""
-    home = Path.home()
+    try:
+        home = Path.home()
+    except RuntimeError:  # a user without one
+        return str(path)
     return f"~/{path.relative_to(home)}" if path.is_relative_to(home) else str(path)
 
 

@@ -99,3 +99,18 @@ def test_the_status_is_that_of_the_quick_checks(
     assert main(["info", "--json"]) == status
     (check,) = json.loads(capsys.readouterr().out)["checks"]
     assert check["passed"] == passed
+
+
+def test_a_user_without_a_home_and_a_file_that_vanishes(
+    cache: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    offer(monkeypatch, Case("one", "alpha", "holds", lambda _: Measured(True, "fine")))
+
+    def none() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "home", none)
+    (cache / "gone").symlink_to("nowhere")
+    assert main(["info", "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert (facts["cache"], facts["cache_size"]) == (str(cache), 3000)
