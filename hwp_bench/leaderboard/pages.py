@@ -24,6 +24,7 @@ from hwp_bench.analysis.pairing import MACRO, MethodRuns
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import atomic_write, read_json, sha256_json
 from hwp_bench.base.tables import Column, Table, format_table, without_empty_columns
+from hwp_bench.evaluation.sentences import ALONE
 from hwp_bench.leaderboard.board import BoardRow, method_rows, ranks_of
 from hwp_bench.leaderboard.rules import shipped_manifests, sound_entries, tables_of
 from hwp_bench.leaderboard.submit import PLACE
@@ -280,6 +281,8 @@ def _facts(rows: Sequence[BoardRow]) -> str:
         "Budget": _shared(rows, lambda row: [row.budget]),
         "Seeds": _shared(rows, lambda row: map(str, row.seeds)),
         "Machine": _shared(rows, lambda row: map(_machine, _runs(row))),
+        "Cores that a fit used": _cores(rows),
+        "Fits that shared their core": _disturbed(rows),
         "Runs": " to ".join(dict.fromkeys((days[0], days[-1]))),
         "Commit": _shared(rows, lambda row: _environment(row, "commit")),
         "Toolkit's code": _shared(
@@ -301,6 +304,28 @@ def _shared(rows: Sequence[BoardRow], facts: Callable[[BoardRow], Iterable[str]]
     *fewer, (most, _) = sorted(groups.items(), key=lambda group: len(group[1]))
     told = [f"{text} ({', '.join(titles)})" for text, titles in fewer]
     return "; ".join([*told, f"{most} (the others)" if fewer else most])
+
+
+def _timed(row: BoardRow) -> list[float]:
+    """The mean number of cores that each fit on the CPU used."""
+    return [
+        one.cpu_seconds / one.fit_seconds
+        for one in row.captures
+        if one.device == "cpu" and one.cpu_seconds and one.fit_seconds
+    ]
+
+
+def _cores(rows: Sequence[BoardRow]) -> str:
+    """The least and the most cores that the fits of a row used on average."""
+    means = [fmean(shares) for shares in map(_timed, rows) if shares]
+    return f"{min(means):.2f} to {max(means):.2f}" if means else ""
+
+
+def _disturbed(rows: Sequence[BoardRow]) -> str:
+    """The rows with fits that had less than a core, and how many of each."""
+    counts = {row.title: [share < ALONE for share in _timed(row)] for row in rows}
+    told = [f"{sum(few)} of {len(few)} ({title})" for title, few in counts.items() if any(few)]
+    return ", ".join(told)
 
 
 def _runs(row: BoardRow) -> list[Results]:

@@ -18,6 +18,7 @@ from hwp_bench.cli.main import main
 from hwp_bench.leaderboard.pages import (
     PICTURES,
     Sources,
+    _facts,
     _novel_views,
     against_each,
     find_faults,
@@ -34,6 +35,21 @@ TYPED = "[generated]\n[definitions]\n[unsourced]\n"
 
 def test_the_pages_say_what_the_files_say() -> None:
     assert find_faults(ROOT) == [], "run hwp-bench dev docs-results"
+
+
+def test_the_page_names_fits_that_shared_their_core(tmp_path: Path) -> None:
+    budget = {"seconds": 64.0, "steps": None}
+    made = complete_results("plain", suite_name="mini", budget=budget)
+    captures = [
+        replace(one, device="cpu", fit_seconds=64.0, cpu_seconds=32.0 if number < 2 else 64.0)
+        for number, one in enumerate(made.captures)
+    ]
+    add_entries(tmp_path / PLACE, [replace(made, captures=captures)])
+    (field,) = Sources(tmp_path).fields
+    text = _facts(field.rows)
+    # Six of eight fits had a core, two a half.
+    assert "- **Cores that a fit used**: 0.88 to 0.88" in text
+    assert "- **Fits that shared their core**: 2 of 8 (Plain)" in text
 
 
 def field_results():
