@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import tempfile
 import time
 import tomllib
@@ -25,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from benchmarks.ratio_store import origin
 from hwp_bench.base.errors import BadInput
@@ -134,6 +136,10 @@ def main() -> None:
         help="NAME=VALUE,...: one row of the table, in place of the trials",
     )
     arguments = parser.parse_args()
+    if arguments.seconds is not None:
+        # Processor seconds are those of one core: a second thread would use up the budget.
+        os.environ["OMP_NUM_THREADS"] = "1"
+        torch.set_num_threads(1)
     for method in arguments.methods or read_trials():
         print_table(method, arguments)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
@@ -10,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from painted import QUICK, SilentReport
 
 from benchmarks import validation
@@ -107,3 +110,20 @@ def test_a_row_of_ones_own_is_neither_read_from_the_log_nor_kept(
     assert rates[-2:] == [today, today]
     assert before != today
     assert log.read_bytes() == kept
+
+
+def test_processor_seconds_are_those_of_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[Any] = []
+
+    def look(*given: Any) -> None:
+        seen.append((os.environ.get("OMP_NUM_THREADS"), torch.get_num_threads()))
+
+    monkeypatch.setattr(validation, "print_table", look)
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
+    monkeypatch.setattr(sys, "argv", ["validation", "plain", "--seconds", "1"])
+    before = torch.get_num_threads()
+    try:
+        validation.main()
+    finally:
+        torch.set_num_threads(before)
+    assert seen == [("1", 1)]
