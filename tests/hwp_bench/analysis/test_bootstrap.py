@@ -33,6 +33,26 @@ def test_without_spread_in_captures_it_is_students_interval() -> None:
     p = stats.ttest_1samp(values, 0).pvalue
     assert estimate.p == pytest.approx(p, rel=0.05)
     assert estimate.above == pytest.approx(1 - p / 2, rel=0.01)
+    # Found with 80 %: beyond the end of the interval by the quantile of 0.8.
+    reach = stats.t.ppf(0.975, 4) + stats.t.ppf(0.8, 4)
+    assert estimate.detectable == pytest.approx(reach * stats.sem(values), rel=0.03)
+
+
+def test_one_capture_of_several_seeds_has_students_interval_over_the_seeds() -> None:
+    sample = np.repeat([[0.0], [1.0], [2.0]], 36, axis=1)  # six blocks of six frames
+    estimate = bootstrap_mean([sample], resamples=20_000)
+    low, high = stats.t.interval(0.95, 2, 1.0, stats.sem([0, 1, 2]))
+    assert (estimate.low, estimate.high) == pytest.approx((low, high), abs=0.02 * (high - low))
+
+
+def test_one_capture_of_one_seed_has_students_interval_over_its_blocks() -> None:
+    values = np.random.default_rng(0).normal(1, 1, 100)
+    blocks = np.mean([np.roll(values, -shift) for shift in range(10)], axis=0)
+    estimate = bootstrap_mean([values[None]], resamples=20_000)
+    reach = 2 * stats.t.ppf(0.975, 9) * blocks.std() / 3
+    assert estimate.low is not None
+    assert estimate.high is not None
+    assert estimate.high - estimate.low == pytest.approx(reach, rel=0.03)
 
 
 def test_spread_of_frames_and_seeds_is_counted_once() -> None:

@@ -350,3 +350,13 @@ def test_two_items_share_a_letter_exactly_where_they_are_not_told_apart(case) ->
     for first, second in pairs:
         shared = bool(set(letters[first]) & set(letters[second]))
         assert shared == ((first, second) not in different)
+
+
+def test_equal_means_share_the_smaller_rank() -> None:
+    levels = {"a": 30.0, "b": 30.0, "c": 20.0}
+    made = [
+        made_results(name, lambda c, f, s, level=level: level + c) for name, level in levels.items()
+    ]
+    ranking = rank_methods(group_runs(made), "psnr", resamples=200)
+    found = [(row.standing.label, row.rank, row.best, row.worst) for row in ranking.ranks]
+    assert found == [("A", 1, 1, 2), ("B", 1, 1, 2), ("C", 3, 3, 3)]

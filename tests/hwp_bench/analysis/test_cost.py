@@ -218,3 +218,38 @@ def test_a_fit_of_one_checkpoint_is_a_point() -> None:
     )
     with pytest.raises(UsageError, match="no result has a curve of psnr"):
         analyse_cost(group_runs([bare]), "psnr")
+
+
+def with_curves(name: str, curves: list[list[tuple[float, float]]]):
+    """A method with a curve of its own on each capture."""
+    base = made_results(name, flat)
+    rows = [
+        replace(c, curve=[CurvePoint(k, t, 10**8, {"psnr": v}) for k, (t, v) in enumerate(one)])
+        for c, one in zip(base.captures, curves, strict=True)
+    ]
+    return replace(base, captures=rows)
+
+
+def test_the_reference_is_reached_capture_by_capture_by_half_of_the_fits() -> None:
+    plain = with_curves("plain", [[(1.0, score)] for score in (20.0, 22.0, 30.0, 30.0)])
+    # After 2 s, 4 s, never and never.
+    ends = ((2.0, 20.0, 20.0), (4.0, 22.0, 22.0))
+    curves = [[(1.0, 10.0), (time, score), (16.0, last)] for time, score, last in ends]
+    curves += 2 * [[(1.0, 10.0), (16.0, 29.0)]]
+    runs = group_runs([with_curves("mine", curves), plain])
+    found = method_costs(runs, "psnr", reference=runs[1])[0].to_reference
+    assert found is not None
+    assert (found.seconds, found.reached, found.fits) == (pytest.approx(4.0), 2, 4)
+
+
+def test_times_and_memory_by_hand() -> None:
+    made = doubling("mine")  # 16 s and 160 steps; 0.5 s for 6 frames drawn, 0.1 s scored
+    first = replace(made.captures[0], peak_memory=3 * 10**8)
+    made = replace(made, captures=[first, *made.captures[1:]])
+    table = analyse_cost(group_runs([made]), "psnr").tables["times"]
+    row = dict(zip([column.title for column in table.columns], table.rows[0], strict=True))
+    assert (row["Fit [s]"], row["Steps"], row["Whole process [s]"]) == (16.0, 160.0, 4.0)
+    assert row["Step [ms]"] == pytest.approx(100.0)
+    assert row["Render [ms/frame]"] == pytest.approx(500 / 6)
+    assert row["Score [ms/frame]"] == pytest.approx(100 / 6)
+    assert row["Peak memory [GB]"] == pytest.approx(0.3)

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from small_captures import CaptureMaker, cameras, hand_parameters, hand_picture
 
-from hwp_bench.base.arrays import read_npz, write_npz
+from hwp_bench.base.arrays import evenly, read_npz, write_npz
+from hwp_bench.base.drawing import GAP, LABEL_HEIGHT, outlined
 from hwp_bench.base.errors import (
     BadCapture,
     BadInput,
@@ -24,10 +25,11 @@ from hwp_bench.base.errors import (
     UsageError,
 )
 from hwp_bench.capture import Cameras, Capture, CaptureWriter, open_capture
-from hwp_bench.capture.check import check_capture, mesh_problems
+from hwp_bench.capture.check import check_capture, contact_sheet, draw_hands, mesh_problems
 from hwp_bench.capture.schema import read_subject_mesh, write_subject_mesh
 from hwp_bench.cli.main import main
 from hwp_bench.hands import HandTemplate, load_template, mirror_template
+from hwp_bench.hands.skinning import pose_parameters
 from hwp_bench.hands.template import rebuilt
 from hwp_bench.metrics.score import score_frame
 
@@ -432,3 +434,23 @@ def test_a_simulated_capture_without_effects_has_none(make_capture: CaptureMaker
 
     info = make_capture(perturbations={}).info
     assert _perturbed_frames(replace(info, source={"kind": "simulated"})) == {}
+
+
+def test_the_contact_sheet_draws_each_frame_with_its_own_mask_and_hands(
+    make_painted: Callable[..., Capture],
+) -> None:
+    """Oracle: landmarks projected by the pinhole formula here."""
+    capture = make_painted("both")
+    edge = capture.info.width
+    page = contact_sheet(capture, count=6, edge=edge)
+    for place, frame in enumerate(evenly(len(capture), 6).tolist()):
+        seen = {}
+        for side in capture.info.sides:
+            posed = pose_parameters(capture.template(side), capture.hands[side])
+            points, view = posed.landmarks[frame].numpy(), capture.cameras.viewmats[frame]
+            rays = (points @ view[:3, :3].T + view[:3, 3]) @ capture.cameras.Ks[frame].T
+            seen[side] = rays[:, :2] / rays[:, 2:]
+        expected = draw_hands(outlined(capture.frame(frame), capture.mask(frame)), seen)
+        left = GAP + place * (edge + GAP)
+        tile = page[GAP + LABEL_HEIGHT :][:edge, left : left + edge]
+        assert (tile != expected).any(axis=2).mean() < 0.01

@@ -18,6 +18,7 @@ from hwp_bench.capture import Capture, HandModelId, open_capture
 from hwp_bench.capture.check import check_capture
 from hwp_bench.capture.convert import (
     FORMATS,
+    convert_capture,
     convert_hand,
     hand_meshes,
     with_one_shape,
@@ -222,6 +223,9 @@ def test_the_command_writes_a_mesh_and_names_what_is_wrong(
     root = str(make_painted("right").root)
     assert main(["data", "export", root, "-o", str(tmp_path / "hand.glb"), "--frame", "2"]) == 0
     assert "right hand" in capsys.readouterr().out
+    read = trimesh.load(tmp_path / "hand.glb", force="mesh")
+    corners = hand_meshes(make_painted("right"), 2)["right"].vertices
+    np.testing.assert_allclose(read.bounds, [corners.min(0), corners.max(0)], atol=1e-6)
     for words, problem in (
         ([root, "-o", str(tmp_path / "hand.xyz")], "Use one of .glb"),
         ([root, "-o", str(tmp_path / "hand.glb"), "--frame", "999"], "there is no frame 999"),
@@ -235,4 +239,16 @@ def test_truth_must_be_known(make_capture: CaptureMaker) -> None:
     with pytest.raises(UsageError, match="does not know the true"):
         hand_meshes(make_capture("a", frames=10), 0, truth=True)
     known = make_capture("b", frames=10, truth=True)
-    assert np.isfinite(hand_meshes(known, 0, truth=True)["right"].vertices).all()
+    assert known.true_hands is not None
+    known.true_hands["right"].transl[3] += 0.5
+    true, given = (hand_meshes(known, 3, truth=one)["right"].vertices for one in (True, False))
+    np.testing.assert_allclose(true - given, 0.5, atol=1e-9)
+
+
+def test_an_existing_output_is_refused_before_the_fit(
+    make_capture: CaptureMaker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, other = make_capture("one", frames=10), make_capture("two", frames=10)
+    monkeypatch.setattr("hwp_bench.capture.convert.convert_hand", lambda *_: pytest.fail("fitted"))
+    with pytest.raises(UsageError, match="--overwrite"):
+        convert_capture(one, other.root, "anny")

@@ -64,12 +64,18 @@ def test_files_of_holes_are_not_copied_whole(tmp_path: Path) -> None:
     assert before == after == "000002.png: is larger than any image may be"
 
 
+def test_extreme_frames_are_those_of_the_scores() -> None:
+    scores = enumerate((30.0, 10.0, 20.0, 25.0))
+    rows = [FrameResult(frame, {"psnr": psnr}, None) for frame, psnr in scores]
+    assert artifacts.find_extreme_frames(rows) == {"worst": 1, "median": 3, "best": 0}
+
+
 #: Test frames and their scores: the middle one is drawn.
 SCORES = {16: 30.0, 17: 10.0, 18: 20.0}
 
 
 def source(folder: Path, capture: Capture, *, predicted: bool) -> ResultsSource:
-    """An entry whose predictions are the truth, or that has none."""
+    """An entry whose prediction of the middle frame is the truth, or that has none."""
     example = results_example("truth" if predicted else "silent")
     frames = [FrameResult(frame, {"psnr": psnr}, None) for frame, psnr in SCORES.items()]
     captures = [replace(example.captures[0], id=capture.info.id, frames=frames)]
@@ -77,7 +83,8 @@ def source(folder: Path, capture: Capture, *, predicted: bool) -> ResultsSource:
         place = folder / "captures" / capture.info.id / "predictions"
         place.mkdir(parents=True)
         for frame in SCORES:
-            write_image(place / frame_name(frame), capture.frame(frame))
+            pixels = capture.frame(frame)
+            write_image(place / frame_name(frame), pixels if frame == 18 else 0 * pixels)
     return ResultsSource(replace(example, captures=captures), folder)
 
 

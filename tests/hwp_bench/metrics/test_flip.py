@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import importlib.machinery
+import sys
+import types
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -43,3 +48,35 @@ def test_flip_of_the_box_is_that_of_the_whole_frame_on_black() -> None:
     assert found["flip"] == pytest.approx(whole, abs=1e-5)
     same = score_frame(target, target, mask, coverage=True, networks={"flip": flip_map})
     assert same["flip"] == 0.0
+
+
+def test_flip_is_the_map_of_distances_of_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Oracle: a stand-in with the package's call, whose distance is the mean difference."""
+    asked = []
+
+    def evaluate(
+        reference: Any,
+        test: Any,
+        kind: str,
+        *,
+        applyMagma: bool,
+        computeMeanError: bool,
+        **more: Any,
+    ) -> Any:
+        asked.append((reference.dtype, test.dtype, kind, more))
+        distance = np.abs(reference - test).mean(axis=2, keepdims=True)
+        return (np.repeat(distance**0.5, 3, axis=2) if applyMagma else distance), None, {}
+
+    module = types.ModuleType("flip_evaluator")
+    module.__spec__ = importlib.machinery.ModuleSpec("flip_evaluator", None)
+    module.evaluate = evaluate  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "flip_evaluator", module)
+    from hwp_bench.metrics.lpips import flip_map, load_available
+
+    assert load_available()["flip"] is flip_map
+    prediction, target, mask = _pair()
+    found = score_frame(prediction, target, mask, coverage=True, networks={"flip": flip_map})
+    expected = np.abs(prediction / 255.0 - target / 255.0)[mask].mean()
+    assert found["flip"] == pytest.approx(expected, abs=1e-6)
+    # 67 pixels a degree: its default.
+    assert asked == [(np.dtype("f4"), np.dtype("f4"), "LDR", {})]

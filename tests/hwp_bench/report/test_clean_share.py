@@ -143,3 +143,21 @@ def test_the_command_prints_it_and_the_figure_has_every_method(study, tmp_path, 
     ]
     assert [list(line.get_ydata()) for line in curves] == [[20.5, 26.5], [23.5, 27.5]]
     assert [tick.get_text() for tick in axes.get_xticklabels()] == ["10 %", "60 %"]
+
+
+def test_a_score_is_the_mean_over_the_captures_of_its_share(make_results, make_capture) -> None:
+    info = make_capture("capture2").info
+    captures = {digit * 64: replace(info, source={"clean_share": 0.1}) for digit in "12"}
+    results = []
+    for name, levels in (("plain", (20, 30)), ("mine", (21, 34))):
+        own = [
+            replace(make_results(name, level).captures[0], id=f"c{number}", digest=digest)
+            for number, (level, digest) in enumerate(zip(levels, captures, strict=True))
+        ]
+        results.append(replace(make_results(name), suite="few", captures=own))
+    plain, mine = scores_by_share(results, captures, "psnr")
+    # Frames of `level` and one more: 20.5, 30.5 and 21.5, 34.5.
+    assert (plain.score.value, plain.score.captures) == (pytest.approx(25.5), 2)
+    assert (mine.score.value, mine.score.captures) == (pytest.approx(28.0), 2)
+    assert mine.behind is not None
+    assert (mine.behind.value, mine.behind.captures) == (pytest.approx(2.5), 2)

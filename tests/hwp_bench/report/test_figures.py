@@ -4,26 +4,33 @@ from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ET
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from made_results import made_results
+from small_captures import CaptureMaker
 
 from hwp_bench.analysis.bootstrap import Estimate
 from hwp_bench.analysis.cost import analyse_cost
 from hwp_bench.analysis.pairing import group_runs
 from hwp_bench.report.figures import (
     PALETTE,
+    StripMethod,
     bands_text,
+    bars_by_perturbation,
     draw_bars,
     draw_leads,
     draw_pareto,
     inline_svg,
+    strip_plot,
     write_cost,
     write_figure,
 )
 from hwp_bench.report.page import style_sheet
+from hwp_bench.results import Results
+from hwp_bench.taxonomy import perturbation
 
 HOSTILE = 'a $x^2$ </title><script>"&'
 
@@ -180,3 +187,28 @@ def test_leads_have_a_bar_from_zero_an_interval_and_a_number_each() -> None:
     low, high = axes.get_xlim()
     assert low < -3.0
     assert high > 4.0
+
+
+def test_severities_stand_at_their_frames(
+    make_capture: CaptureMaker, make_results: Callable[..., Results]
+) -> None:
+    info = make_capture("capture2").info  # 20 frames, severity 3 in 1, 5, 9, 13, 17
+    method = StripMethod(0, "Mine", make_results("mine").captures[0], {})
+    root = drawn(str(strip_plot([method], info, "psnr")))
+    lefts = []
+    for item in of_class(root, "severity"):
+        path = item.find("path")
+        assert path is not None
+        places = re.findall(r"[ML] (\S+) (\S+)", path.get("d") or "")
+        lefts.append(min(float(x) for x, _ in places))
+    assert lefts == pytest.approx([44 + 406 * frame / 20 for frame in (1, 5, 9, 13, 17)], abs=0.02)
+
+
+def test_bars_are_of_each_method_and_perturbation() -> None:
+    made = [
+        made_results(name, lambda c, f, s, level=level: level + c)
+        for name, level in (("mine", 20.0), ("plain", 10.0))
+    ]
+    root = drawn(str(bars_by_perturbation(group_runs(made), "psnr")))
+    heads = [perturbation(name).heading for name in ("illumination", "motion_blur")]
+    assert words(root) == [heads[0], "20.50", "10.50", heads[1], "22.50", "12.50"]

@@ -1,7 +1,8 @@
-"""Where a clip is drawn to. Oracle: the option's name in the message, and the files on disk."""
+"""A clip that is drawn, and where to. Oracles: single frames, messages, the files on disk."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,6 +12,9 @@ import pytest
 from small_captures import CaptureMaker
 
 from hwp_bench.base.errors import UsageError
+from hwp_bench.base.images import read_rgb
+from hwp_bench.capture import Capture
+from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.render import render_clip
 
 
@@ -33,3 +37,19 @@ def test_an_existing_folder_is_refused_with_the_option_that_replaces_it(
     with pytest.raises(UsageError, match="something else than frames"):
         render_clip(avatar, capture, range(1), out, overwrite=True)
     assert (out / "thesis.tex").is_file()
+
+
+def test_every_frame_is_drawn_in_its_own_pose_over_the_background(
+    tiny_avatar: WildGHandAvatar, make_painted: Callable[..., Capture], tmp_path: Path
+) -> None:
+    """Oracle: the avatar's own drawing of each frame, laid over the grey here; half a level."""
+    capture = make_painted()
+    render_clip(tiny_avatar, capture, range(2, 11, 8), tmp_path / "frames", background=100)
+    images = sorted((tmp_path / "frames").iterdir())
+    found = {int(path.stem): read_rgb(path).astype(float) for path in images}
+    assert list(found) == [2, 10]
+    for frame, image in found.items():
+        rgba = tiny_avatar.render(capture.hand_poses(frame), capture.camera(frame)).astype(float)
+        expected = 255.0 * rgba[..., :3] + 100.0 * (1.0 - rgba[..., 3:])
+        np.testing.assert_allclose(image, expected, atol=0.51)
+    assert not np.array_equal(found[2], found[10])

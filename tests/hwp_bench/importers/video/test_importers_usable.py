@@ -211,3 +211,28 @@ def test_one_message_with_a_sheet_comes_before_the_import(
         import_video(video, tracked, tmp_path / "capture")
     said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("warning: ")]
     assert "cut off in 10 of 10 frames" in said[0]
+
+
+@pytest.mark.parametrize(("bad", "fatal"), [(1, []), (2, [False]), (5, [False]), (6, [True])])
+@pytest.mark.parametrize(
+    ("field", "most", "beyond"),
+    [("outside", 2, 3), ("moved", 1.0, 1.01), ("bright", 0.3, 0.31), ("dark", 0.7, 0.71)],
+)
+def test_faults_begin_where_the_page_says(
+    sound: VideoSource, field: str, most: float, beyond: float, bad: int, fatal: list[bool]
+) -> None:
+    """docs/video.md: more than a tenth of the frames is a warning, more than half too much."""
+    values = np.full(FRAMES, float(most))
+    values[:bad] = beyond
+    given = replace(measure(sound, sound.landmarks), **{field: values})  # type: ignore[arg-type]
+    found = find_faults(sound, "right", given, VideoImport())
+    assert [fault.fatal for fault in found] == fatal
+
+
+@pytest.mark.parametrize(("size", "fatal"), [(60.0, []), (59.5, [True])])
+def test_a_hand_of_sixty_pixels_is_large_enough(
+    sound: VideoSource, size: float, fatal: list[bool]
+) -> None:
+    given = replace(measure(sound, sound.landmarks), size=np.full(FRAMES, size))
+    found = find_faults(sound, "right", given, VideoImport())
+    assert [fault.fatal for fault in found] == fatal

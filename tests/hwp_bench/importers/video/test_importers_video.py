@@ -20,6 +20,7 @@ from synthetic_clip import (
     write_video,
 )
 
+from hwp_bench.base.drawing import GAP, LABEL_HEIGHT, outlined
 from hwp_bench.base.errors import BadInput, HwpError, UsageError
 from hwp_bench.base.images import read_rgb, write_image
 from hwp_bench.capture import Capture, open_capture
@@ -97,7 +98,10 @@ def test_the_capture_is_sound(capture: Capture, clip: SyntheticClip) -> None:
     extra = json.loads((capture.root / "extra" / "import.json").read_text())
     assert len(extra.pop("call")) == 64
     assert extra == info.source["fit"]
-    assert read_rgb(capture.root / "extra" / "overlay.png").shape[2] == 3
+    shown = read_rgb(capture.root / "extra" / "overlay.png")[GAP + LABEL_HEIGHT :][:128, GAP:]
+    np.testing.assert_array_equal(shown[:, :128], outlined(capture.frame(0), capture.mask(0)))
+    drawn = (shown[:, 128:256] != capture.frame(0)).any(axis=2)
+    assert drawn[capture.mask(0) > 127].mean() > 0.5
 
 
 def test_times_of_frames_are_kept(folder: Path, clip: SyntheticClip, tmp_path: Path) -> None:
