@@ -46,7 +46,7 @@ def download(file: Pinned, target: IO[bytes], opener: Opener | None = None) -> N
     """
     digest, size = hashlib.sha256(), 0
     for piece in _pieces(file, opener):
-        # A target that cannot be written is no fault of the network.
+        # Outside of what is taken for a fault of the network.
         target.write(piece)
         digest.update(piece)
         size += len(piece)

@@ -41,7 +41,7 @@ def test_the_page_names_fits_that_shared_their_core(tmp_path: Path) -> None:
     budget = {"seconds": 64.0, "steps": None}
     made = complete_results("plain", suite_name="mini", budget=budget)
     captures = [
-        replace(one, device="cpu", fit_seconds=64.0, cpu_seconds=32.0 if number < 2 else 64.0)
+        replace(one, device="cpu", fit_seconds=4.0, cpu_seconds=2.0 if number < 2 else 4.0)
         for number, one in enumerate(made.captures)
     ]
     add_entries(tmp_path / PLACE, [replace(made, captures=captures)])
