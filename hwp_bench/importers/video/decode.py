@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Container, Generator, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -275,17 +275,23 @@ def read_masks(
 
 
 def read_frames(
-    info: VideoInfo, selection: FrameRange, ended: Callable[[Reading], None] | None = None
+    info: VideoInfo,
+    selection: FrameRange,
+    ended: Callable[[Reading], None] | None = None,
+    wanted: Container[int] | None = None,
 ) -> Generator[tuple[int, np.ndarray]]:
     """Decode the selected frames: yields the index in the video, and (H, W, 3) uint8 sRGB.
 
     Those between are decoded and dropped, because seeking is not exact in every container. `ended`
-    gets the outcome when the video was read to its end, which a `stop` prevents.
+    gets the outcome when the video was read to its end, which a `stop` prevents. Of the selected
+    frames only those in `wanted` are converted and yielded; None: all.
     """
     with _opened(info.path) as video:
         index = 0
         for index, frame, colours in video.frames(selection.stop):
             if index < selection.start or (index - selection.start) % selection.stride:
+                continue
+            if wanted is not None and index not in wanted:
                 continue
             if video.upright_size(frame) != (info.width, info.height):
                 raise BadInput(

@@ -449,12 +449,11 @@ def _pictures(source: VideoSource, landmarks: Landmarks) -> tuple[list[int], lis
     extent = np.median(np.ptp(landmarks.image[seen], axis=1).max(axis=1))
     blur = max(float(extent) / _HAND_EDGE, 0.5)
     rows, pictures = [], []
-    first, last = min(numbers), max(numbers)
-    for number, image in read_frames(source.video, FrameRange(first, last + 1)):
-        if number in numbers:
-            soft = cv2.GaussianBlur(image, (0, 0), blur)
-            rows.append(numbers[number])
-            pictures.append(cv2.cvtColor(soft, cv2.COLOR_RGB2LAB))
+    selection = FrameRange(min(numbers), max(numbers) + 1)
+    for number, image in read_frames(source.video, selection, wanted=numbers):
+        soft = cv2.GaussianBlur(image, (0, 0), blur)
+        rows.append(numbers[number])
+        pictures.append(cv2.cvtColor(soft, cv2.COLOR_RGB2LAB))
     return rows, pictures
 
 

@@ -24,7 +24,7 @@ from hwp_bench.base.errors import BadInput
 from hwp_bench.capture.check import check_capture
 from hwp_bench.cli.main import main
 from hwp_bench.importers.shared.landmarks import HandTracks, write_hand_tracks
-from hwp_bench.importers.video import VideoImport, import_video
+from hwp_bench.importers.video import VideoImport, decode, import_video
 from hwp_bench.importers.video import api as pipeline
 from hwp_bench.importers.video.api import drop_blank_frames
 from hwp_bench.importers.video.decode import FrameRange, probe, read_frames, read_times
@@ -111,6 +111,20 @@ def test_landmarks_of_different_frames_are_told(source: VideoSource) -> None:
     hand = replace(source.landmarks, world=source.landmarks.world @ turns)
     said = landmark_doubts(replace(source, hands={"right": hand}))
     assert said == ("`image` and `world` do not show the same hand in the same frames",)
+
+
+def test_only_frames_that_are_looked_at_are_converted(
+    source: VideoSource, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    honest, converted = decode.to_srgb, []
+
+    def count(*given: Any, **more: Any) -> np.ndarray:
+        converted.append(1)
+        return honest(*given, **more)
+
+    monkeypatch.setattr(decode, "to_srgb", count)
+    assert landmark_doubts(source) == ()
+    assert 0 < len(converted) <= 12 < FRAMES
 
 
 @pytest.mark.parametrize("less", [1, 4])
