@@ -11,6 +11,14 @@ from typing import Any
 
 import numpy as np
 
+#: Weights of red and blue by the number of the matrix in H.273.
+WEIGHTS = {1: (0.2126, 0.0722), 5: (0.299, 0.114), 6: (0.299, 0.114), 9: (0.2627, 0.0593)}
+#: ITU-R BT.2087: linear BT.2020 to BT.709.
+TO_BT709 = np.array(
+    [[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]]
+)
+#: Marks of HLG in BT.2020, and its samples, as phones write them.
+HLG = {"colorspace": 9, "color_primaries": 9, "color_trc": 18, "color_range": 1}
 #: Encoders that keep every sample.
 LOSSLESS = {
     "libx264": {"qp": "0", "preset": "ultrafast"},
@@ -40,6 +48,46 @@ def pictures(count: int = 24, size: tuple[int, int] = (64, 48)) -> list[np.ndarr
         image[:, width // 2 :] += rng.integers(0, 30, (height, width - width // 2, 3), np.uint8)
         made.append(image)
     return made
+
+
+def from_srgb(values: np.ndarray) -> np.ndarray:
+    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+
+
+def scene_to_hlg(light: np.ndarray) -> np.ndarray:
+    a = 0.17883277
+    b, c = 1 - 4 * a, 0.5 - a * np.log(4 * a)
+    high = a * np.log(np.maximum(12 * light - b, 1e-9)) + c
+    return np.where(light <= 1 / 12, np.sqrt(3 * light), high)
+
+
+def samples_of(signal: np.ndarray, matrix: int, *, full: bool, bits: int) -> list[np.ndarray]:
+    """Rounded samples (N,) of signals (N, 3)."""
+    red, blue = WEIGHTS[matrix]
+    y = signal @ [red, 1 - red - blue, blue]
+    cb, cr = (signal[:, 2] - y) / (2 - 2 * blue), (signal[:, 0] - y) / (2 - 2 * red)
+    step, most = 2 ** (bits - 8), 2**bits - 1
+    if full:
+        values = y * most, cb * most + 128 * step, cr * most + 128 * step
+    else:
+        values = (16 + 219 * y) * step, (128 + 224 * cb) * step, (128 + 224 * cr) * step
+    kind = np.uint8 if bits == 8 else np.uint16
+    return [np.clip(np.round(value), 0, most).astype(kind) for value in values]
+
+
+def ordinary_hlg(values: np.ndarray) -> list[np.ndarray]:
+    """Samples (N,) of sRGB in [0, 1], (N, 3), shown at 203 cd/m2: HLG in BT.2020, 10 bits."""
+    light = from_srgb(values) @ np.linalg.inv(TO_BT709).T * 0.203
+    bright = light @ [0.2627, 0.6780, 0.0593]
+    scene = light * np.maximum(bright, 1e-9)[:, None] ** (1 / 1.2 - 1)
+    return samples_of(scene_to_hlg(scene), 9, full=False, bits=10)
+
+
+def hlg_frame(image: np.ndarray) -> list[np.ndarray]:
+    """Planes, 4:2:0, of a frame (H, W, 3) uint8 sRGB of even size."""
+    planes = ordinary_hlg(image.reshape(-1, 3) / 255.0)
+    first, *rest = (plane.reshape(image.shape[:2]) for plane in planes)
+    return [first, *(plane[::2, ::2] for plane in rest)]
 
 
 def write_samples(

@@ -20,6 +20,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from encoded_video import HLG, hlg_frame, write_samples
 from synthetic_clip import landmark_import, make_clip, write_landmarks, write_video
 from two_hand_clip import make_two_hands, write_two_hands
 
@@ -378,6 +379,25 @@ def test_frames_with_a_hand_are_counted_among_those_that_are_taken(
     write_landmarks(folder / "hand.npz", make_clip(COUNT).landmarks, score=score)
     with pytest.raises(BadInput, match="in 2 of the 4 frames that are taken of 16"):
         make_avatar(folder / "hand.avi", folder / "other", choices(folder))
+
+
+def test_a_phones_hdr_video_becomes_the_avatar_of_the_ordinary_one(
+    made: Path, tmp_path: Path
+) -> None:
+    """Oracle: the frames of the ordinary video, as dark as those that were written; 3 levels."""
+    clip = make_clip(COUNT)
+    pictures = [np.rint(0.7 * clip.picture(frame)).astype(np.uint8) for frame in range(COUNT)]
+    planes = [hlg_frame(picture) for picture in pictures]
+    video = write_samples(tmp_path / "hand.mov", planes, "yuv420p10le", "libx265", marks=HLG)
+    write_landmarks(tmp_path / "hand.npz", clip.landmarks)
+    make_avatar(video, tmp_path / "my_hand", choices(tmp_path))
+    assert (tmp_path / "my_hand" / "avatar.html").is_file()
+    ordinary, hdr = (open_capture(one / "my_hand/work/capture") for one in (made, tmp_path))
+    for frame in range(0, COUNT, 5):
+        hand = (ordinary.mask(frame) > 127) & (hdr.mask(frame) > 127)
+        assert hand.sum() > 1000
+        means = [one.frame(frame)[hand].mean(axis=0) for one in (ordinary, hdr)]
+        np.testing.assert_allclose(means[1], 0.7 * means[0], atol=3.0)
 
 
 def test_what_is_advised_for_faint_hands_takes_them(

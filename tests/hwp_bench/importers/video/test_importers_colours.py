@@ -13,19 +13,22 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from encoded_video import pictures, write_pictures, write_samples
+from encoded_video import (
+    HLG,
+    TO_BT709,
+    WEIGHTS,
+    from_srgb,
+    ordinary_hlg,
+    pictures,
+    samples_of,
+    write_pictures,
+    write_samples,
+)
 
 from hwp_bench.base.errors import BadInput
 from hwp_bench.importers.video.decode import FrameRange, probe, read_frames
 
-#: Weights of red and blue by the number of the matrix in H.273.
-WEIGHTS = {1: (0.2126, 0.0722), 5: (0.299, 0.114), 6: (0.299, 0.114), 9: (0.2627, 0.0593)}
-#: ITU-R BT.2087: linear BT.2020 to BT.709.
-TO_BT709 = np.array(
-    [[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]]
-)
 ROUNDED, FAST = 0.55, 2.95
-HLG = {"colorspace": 9, "color_primaries": 9, "color_trc": 18, "color_range": 1}
 PQ = {**HLG, "color_trc": 16}
 PATCH, ROWS, COLUMNS = 8, 6, 8
 
@@ -35,21 +38,10 @@ def srgb(linear: np.ndarray) -> np.ndarray:
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
-def from_srgb(values: np.ndarray) -> np.ndarray:
-    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
-
-
 def hlg_to_scene(x: np.ndarray) -> np.ndarray:
     a = 0.17883277
     b, c = 1 - 4 * a, 0.5 - a * np.log(4 * a)
     return np.where(x <= 0.5, x * x / 3, (np.exp((x - c) / a) + b) / 12)
-
-
-def scene_to_hlg(light: np.ndarray) -> np.ndarray:
-    a = 0.17883277
-    b, c = 1 - 4 * a, 0.5 - a * np.log(4 * a)
-    high = a * np.log(np.maximum(12 * light - b, 1e-9)) + c
-    return np.where(light <= 1 / 12, np.sqrt(3 * light), high)
 
 
 M1, M2, C1, C2, C3 = 0.1593017578125, 78.84375, 0.8359375, 18.8515625, 18.6875
@@ -104,20 +96,6 @@ def signal_of(planes: Sequence[np.ndarray], matrix: int, *, full: bool, bits: in
     red, blue = WEIGHTS[matrix]
     r, b = y + 2 * (1 - red) * cr, y + 2 * (1 - blue) * cb
     return np.stack([r, (y - red * r - blue * b) / (1 - red - blue), b], axis=-1)
-
-
-def samples_of(signal: np.ndarray, matrix: int, *, full: bool, bits: int) -> list[np.ndarray]:
-    """Rounded samples (N,) of signals (N, 3)."""
-    red, blue = WEIGHTS[matrix]
-    y = signal @ [red, 1 - red - blue, blue]
-    cb, cr = (signal[:, 2] - y) / (2 - 2 * blue), (signal[:, 0] - y) / (2 - 2 * red)
-    step, most = 2 ** (bits - 8), 2**bits - 1
-    if full:
-        values = y * most, cb * most + 128 * step, cr * most + 128 * step
-    else:
-        values = (16 + 219 * y) * step, (128 + 224 * cb) * step, (128 + 224 * cr) * step
-    kind = np.uint8 if bits == 8 else np.uint16
-    return [np.clip(np.round(value), 0, most).astype(kind) for value in values]
 
 
 #: The finest that encoders have which always lose something.
@@ -259,10 +237,7 @@ def test_an_ordinary_picture_in_hlg_comes_back(tmp_path: Path) -> None:
     """
     given = np.clip(colours()[:12], 0, 1) * 0.7
     given = np.concatenate([given] * 4)
-    light = from_srgb(given) @ np.linalg.inv(TO_BT709).T * 0.203
-    bright = light @ [0.2627, 0.6780, 0.0593]
-    scene = light * np.maximum(bright, 1e-9)[:, None] ** (1 / 1.2 - 1)
-    planes = samples_of(scene_to_hlg(scene), 9, full=False, bits=10)
+    planes = ordinary_hlg(given)
     path = write_patches(tmp_path / "a.mov", planes, "yuv420p10le", "libx265", HLG)
     assert np.abs(read_patches(path) - given * 255).max() <= 2.0
 
