@@ -11,6 +11,7 @@ from hwp_bench.analysis.columns import Filled, score_column, table_of
 from hwp_bench.analysis.compare import Rank, rank_methods, verdict
 from hwp_bench.analysis.pairing import group_runs, same_but_seed, scope_scores
 from hwp_bench.base.tables import Column, Table
+from hwp_bench.evaluation.evaluate import make_budget
 from hwp_bench.leaderboard.entries import BADGES, LEVELS, Entry
 from hwp_bench.leaderboard.rules import HEADLINE, current, source_of, tables_of, takes_over
 from hwp_bench.leaderboard.suite_data import Severities, on_current_data, suite_severities
@@ -263,8 +264,14 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 
 def budget_text(budget: Mapping[str, Any]) -> str:
-    """Return a budget in words: `60 s`, `60 s, 100,000 steps` or `no limit`."""
+    """Return a budget in words: `60 s`, `60 s, 900 steps` or `no limit`.
+
+    A limit of steps that seconds alone have lifted (`make_budget`) is left out.
+    """
     units = {"seconds": "s", "steps": "steps"}
+    seconds = budget.get("seconds")
+    if seconds and budget.get("steps") == make_budget(seconds, None).steps:
+        del units["steps"]
     parts = [f"{budget[name]:,.15g} {unit}" for name, unit in units.items() if budget.get(name)]
     return ", ".join(parts) or "no limit"
 

@@ -43,6 +43,10 @@ BEHIND = 0.5
 _FIRST = ("wild-test", "real-1")
 #: Decibels that may stand outside of a block, by page: see `find_faults`.
 TYPED = "docs/results.toml"
+_UNDECLARED = (
+    "Some of these runs do not say what validation frames served for: they are older than early "
+    "stopping for every method."
+)
 #: Where pictures of blocks lie; their names end in a digest of what they show.
 PICTURES = "docs/pictures/field"
 
@@ -137,7 +141,9 @@ def verdict_of(lead: Estimate | None) -> str | None:
 
 
 def _headline(sources: Sources) -> str:
-    rows = [(one, one.ours, one.others[0]) for one in sources.fields if one.ours and one.others]
+    # One other method is not a field.
+    shown = [one for one in sources.fields if len(one.others) > 1]
+    rows = [(one, one.ours, one.others[0]) for one in shown if one.ours]
     plain = [one.named.get(PLAIN) for one, _, _ in rows]
     best = [f"{other.title}, {other.scores[METRIC]:.2f}" for _, _, other in rows]
     suites = [f"{one.suite}, {len(our.first.captures)} captures" for one, our, _ in rows]
@@ -152,9 +158,15 @@ def _headline(sources: Sources) -> str:
         ),
         (Column("Methods"), [len(one.named) for one, _, _ in rows]),
         (Column("Fit"), [our.budget.split(", ")[0] for _, our, _ in rows]),
-        (Column("Seeds"), [len(our.seeds) for _, our, _ in rows]),
+        (Column("Seeds"), [_seeds(one) for one, _, _ in rows]),
     ]
     return _markdown(table_of("PSNR of clean test frames, dB", columns))
+
+
+def _seeds(one: Field) -> str:
+    """The least and the most seeds of a method."""
+    counts = sorted(len(row.seeds) for row in one.named.values())
+    return " to ".join(dict.fromkeys((str(counts[0]), str(counts[-1]))))
 
 
 def _field(sources: Sources) -> str:
@@ -170,6 +182,9 @@ def _section(one: Field, sources: Sources) -> str:
         against_each(one),
         chosen,
         _captures_behind(one),
+        _UNDECLARED
+        if any(row.first.method.validation is None for row in one.named.values())
+        else "",
     ]
     if one.leads:
         titles = {row.name: row.title for row in one.others}
@@ -283,6 +298,7 @@ def _facts(rows: Sequence[BoardRow]) -> str:
         "Machine": _shared(rows, lambda row: map(_machine, _runs(row))),
         "Cores that a fit used": _cores(rows),
         "Fits that shared their core": _disturbed(rows),
+        "Fits beyond their budget": _late(rows),
         "Runs": " to ".join(dict.fromkeys((days[0], days[-1]))),
         "Commit": _shared(rows, lambda row: _environment(row, "commit")),
         "Toolkit's code": _shared(
@@ -326,6 +342,17 @@ def _disturbed(rows: Sequence[BoardRow]) -> str:
     counts = {row.title: [share < ALONE for share in _timed(row)] for row in rows}
     told = [f"{sum(few)} of {len(few)} ({title})" for title, few in counts.items() if any(few)]
     return ", ".join(told)
+
+
+def _late(rows: Sequence[BoardRow]) -> str:
+    """The rows with fits that took more than a second over their budget, and how many of each."""
+    told = []
+    for row in rows:
+        limit = row.first.budget.get("seconds")
+        fits = [one.fit_seconds for one in row.captures if limit and one.fit_seconds]
+        if late := [seconds for seconds in fits if limit and seconds > limit + 1.0]:
+            told.append(f"{len(late)} of {len(fits)}, up to {max(late):.1f} s ({row.title})")
+    return "; ".join(told)
 
 
 def _runs(row: BoardRow) -> list[Results]:

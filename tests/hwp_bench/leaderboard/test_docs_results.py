@@ -15,6 +15,7 @@ from benchmarks.video_stages import keep
 from hwp_bench.analysis.bootstrap import Estimate
 from hwp_bench.base.errors import UsageError
 from hwp_bench.cli.main import main
+from hwp_bench.leaderboard.entries import make_entry
 from hwp_bench.leaderboard.pages import (
     PICTURES,
     Sources,
@@ -50,6 +51,10 @@ def test_the_page_names_fits_that_shared_their_core(tmp_path: Path) -> None:
     # Six of eight fits had a core, two a half.
     assert "- **Cores that a fit used**: 0.88 to 0.88" in text
     assert "- **Fits that shared their core**: 2 of 8 (Plain)" in text
+    assert "beyond their budget" not in text
+    short = replace(made, captures=captures, budget={"seconds": 2.5, "steps": None})
+    late = replace(field.rows[0], entries=(make_entry(short),))
+    assert "- **Fits beyond their budget**: 8 of 8, up to 4.0 s (Plain)" in _facts([late])
 
 
 def field_results():
@@ -155,6 +160,18 @@ def test_the_field_has_the_means_and_differences_of_the_entries(checkout: Path) 
     assert "on 1 of 8 captures: capture7 (-1.70 dB, Plain)" in page
     assert "- **Seeds**: 0, 1\n" in page
     assert "- **Budget**: 16 s\n" in page
+
+
+def test_the_headline_has_the_fewest_and_the_most_seeds_and_no_lone_pair(tmp_path: Path) -> None:
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "README.md").write_text("<!-- results: headline -->\n<!-- end -->\n")
+    (tmp_path / "docs" / "results.toml").write_text(TYPED)
+    add_entries(tmp_path / PLACE, field_results()[:3])  # WildGHand twice, the plain fit once
+    write_pages(tmp_path)
+    assert "| mini" not in (tmp_path / "README.md").read_text()
+    add_entries(tmp_path / PLACE, field_results()[4:5])
+    write_pages(tmp_path)
+    assert cells((tmp_path / "README.md").read_text(), "mini")[-1] == "1 to 2"
 
 
 def test_a_method_ahead_of_each_other_one_is_said_to_be(tmp_path: Path) -> None:
