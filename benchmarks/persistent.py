@@ -23,6 +23,7 @@ from hwp_bench.api import evaluate
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import atomic_write
 from hwp_bench.base.tables import Table, to_markdown, write_tables
+from hwp_bench.leaderboard.pages import with_digest
 from hwp_bench.methods.manifest import find_method, read_manifest
 from hwp_bench.report.clean_share import clean_share_table, write_clean_share
 from hwp_bench.report.sources import find_captures
@@ -98,14 +99,14 @@ def draw(out: Path, names: Sequence[str], page: Path | None = None) -> None:
         picture = page.parent / "pictures" / "clean-share.png"
         picture.parent.mkdir(parents=True, exist_ok=True)
         picture.write_bytes((out / "clean-share.png").read_bytes())
-        atomic_write(page, _page(results, table))
+        atomic_write(page, with_digest(_page(results, table)))
 
 
 def _page(results: Sequence[Results], table: Table) -> str:
     """The page's Markdown."""
     facts = {
         "Captures": {capture.id for one in results for capture in one.captures},
-        "Steps of a fit": {str(one.budget.get("steps") or "the method's own") for one in results},
+        "Length of a fit": {_length(one.budget) for one in results},
         "Results of": {one.started[:10] for one in results},
         "Method digests": {one.method.digest[:12] for one in results},
         "Processor": {str(one.environment.get("processor", "unknown")) for one in results},
@@ -116,7 +117,8 @@ def _page(results: Sequence[Results], table: Table) -> str:
             "# Scores over the share of clean frames",
             "",
             "This page is written by `benchmarks/persistent.py` from result files. In its captures",
-            "[perturbations last](simulation.md#persistent-perturbations).",
+            "[perturbations last](simulation.md#persistent-perturbations). Equal steps are not",
+            "equal seconds: [methods compared](field.md) have these.",
             "",
             "| | |",
             "| --- | --- |",
@@ -128,6 +130,13 @@ def _page(results: Sequence[Results], table: Table) -> str:
             "",
         ]
     )
+
+
+def _length(budget: Mapping[str, Any]) -> str:
+    """How long a fit of a budget is, in words."""
+    if budget.get("seconds"):
+        return f"{budget['seconds']:g} s"
+    return f"{budget['steps']} steps" if budget.get("steps") else "the method's own"
 
 
 def main() -> None:
