@@ -20,11 +20,12 @@ from hwp_bench.methods.manifest import shipped_methods
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--suites", nargs="+", required=True)
+    parser.add_argument("--methods", nargs="+", help="some of them (default: all)")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--seconds", type=float, default=64.0, help="of each fit")
     parser.add_argument("-o", "--out", type=Path, default=Path("runs/field"))
     given, others = parser.parse_known_args()
-    methods = [method.name for method in shipped_methods()]
+    methods = given.methods or [method.name for method in shipped_methods()]
     limits = ["--seeds", f"{given.seeds}", "--budget", f"{given.seconds:g}"]
     status = 0
     for suite in given.suites:

@@ -25,3 +25,10 @@ def test_every_method_is_evaluated_on_every_suite(monkeypatch: pytest.MonkeyPatc
         assert set(words[1:end]) == {*folders, "wildghand"}
         limits = ["--seeds", "2", "--budget", "8", "-o", f"r/{suite}", "--jobs", "2"]
         assert words[end:] == ["--suite", suite, *limits]
+    # Some methods, with the numbers that are not given.
+    monkeypatch.setattr(
+        sys, "argv", ["field", "--suites", "persistent", "--methods", "plain", "wild"]
+    )
+    field.main()
+    limits = ["--seeds", "3", "--budget", "64", "-o", "runs/field/persistent"]
+    assert calls[-1] == ["evaluate", "plain", "wild", "--suite", "persistent", *limits]
