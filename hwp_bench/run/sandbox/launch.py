@@ -48,6 +48,8 @@ def main(report: int) -> None:
     """
     order = json.loads(sys.stdin.buffer.read())
     os.set_inheritable(report, False)
+    # A program reaches the first process of its sandbox by signals that have a handler there.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     with open(os.devnull, "r+b", buffering=0) as silence:
         os.dup2(silence.fileno(), 0)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
@@ -140,9 +142,13 @@ def _be_first(order: dict[str, Any], go: int, answer: int) -> NoReturn:
         if problem:
             result = {"stage": "command", "problem": problem}
         else:
+            # Whatever fails from here on is not the system's refusal, after which the program
+            # would be started again without a sandbox.
+            result = {"status": 1}
             result = {"status": _wait(child)}
     except OSError as error:
-        result = {"stage": "sandbox", "problem": str(error.args[-1])}
+        if "status" not in result:
+            result = {"stage": "sandbox", "problem": str(error.args[-1])}
     finally:
         os.write(answer, json.dumps(result).encode())
         os._exit(0)
@@ -155,7 +161,7 @@ def _start(order: dict[str, Any]) -> tuple[int, str]:
     if child == 0:
         try:
             # Python ignores some signals, and what is ignored stays so in the new program.
-            for name in ("SIGTERM", "SIGPIPE", "SIGXFSZ"):
+            for name in ("SIGINT", "SIGTERM", "SIGPIPE", "SIGXFSZ"):
                 signal.signal(getattr(signal, name), signal.SIG_DFL)
             os.chdir(order["folder"])
             os.execvpe(order["command"][0], order["command"], order["environment"])

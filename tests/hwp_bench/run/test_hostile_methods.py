@@ -364,3 +364,26 @@ print(json.dumps({
     assert said["keyring"] == -1 or said["keyring"] != mine
     # keyctl(KEYCTL_SEARCH): what a method leaves is not found outside.
     assert libc.syscall(keyctl, 10, ctypes.c_long(-3), b"user", b"left-by-method", 0) == -1
+
+
+def test_a_signal_to_the_first_process_does_not_open_the_walls(
+    tmp_path: Path, namespaces: bool
+) -> None:
+    if not namespaces:
+        pytest.skip("no user namespaces on this machine")
+    # Only inside: never to the machine's own first process.
+    script = (
+        "import json, os, signal, time\n"
+        "if not os.path.exists('/etc/shadow'):\n"
+        "    os.kill(1, signal.SIGINT)\n"
+        "    time.sleep(1)\n"
+        "print(json.dumps(os.path.exists('/etc/shadow')))\n"
+    )
+    method = read_manifest(hostile_method(tmp_path / "method", script))
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # as in a terminal
+    try:
+        record = run_method(method, "tiny", folder_of(tmp_path / "request"), tmp_path / "output")
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert record.isolation == "namespaces"
+    assert "false" in (tmp_path / "output" / "log.txt").read_text()
