@@ -9,6 +9,7 @@ alone, and with training frames that choose how far it bends. `--picture FILE` d
 from __future__ import annotations
 
 import argparse
+import contextlib
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
@@ -65,7 +66,9 @@ class Person:
         judges = data.judges if validation else None
         _ = data.frames  # read before the clock starts
         began = time.perf_counter()
-        with mock.patch.multiple(unknowns, **spreads):
+        with contextlib.ExitStack() as stack:
+            for name, value in spreads.items():
+                stack.enter_context(mock.patch.object(unknowns, name, value))
             shape = find_person(data, judges)
         assert shape is not None
         return shape, time.perf_counter() - began

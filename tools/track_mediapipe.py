@@ -1,4 +1,4 @@
-"""Track one hand in a video with MediaPipe; `hwp-bench data import-video` reads the result.
+"""Track one hand in a video with MediaPipe; `hwp-bench data import video` reads the result.
 
 Runs in its own environment, because MediaPipe pins old packages:
 
