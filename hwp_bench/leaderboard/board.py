@@ -55,14 +55,19 @@ class BoardRow:
         return self.entries[0].counted
 
     @property
+    def runs(self) -> list[Results]:
+        """The results of every seed, the lowest first: those that the board shows."""
+        return [entry.counted for entry in self.entries]
+
+    @property
     def compared(self) -> list[Results]:
         """The results of every seed, as they are compared with other rows."""
-        return [on_current_data(entry.counted) for entry in self.entries]
+        return [on_current_data(one) for one in self.runs]
 
     @property
     def captures(self) -> list[CaptureResult]:
         """The captures of every seed."""
-        return [capture for entry in self.entries for capture in entry.counted.captures]
+        return [capture for one in self.runs for capture in one.captures]
 
     @property
     def seeds(self) -> tuple[int, ...]:
@@ -102,7 +107,7 @@ class BoardRow:
     @cached_property
     def scores(self) -> Mapping[str, float]:
         """Headline scores by metric, means over the seeds; of metrics that every seed has."""
-        found = [entry.counted.scores for entry in self.entries]
+        found = [one.scores for one in self.runs]
         names = [name for name in found[0] if all(name in one for one in found)]
         return {name: sum(one[name] for one in found) / len(found) for name in names}
 

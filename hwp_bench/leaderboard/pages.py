@@ -8,6 +8,7 @@ need a source too (`find_faults`).
 from __future__ import annotations
 
 import json
+import math
 import re
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -43,12 +44,12 @@ BEHIND = 0.5
 _FIRST = ("wild-test", "real-1")
 #: Decibels that may stand outside of a block, by page: see `find_faults`.
 TYPED = "docs/results.toml"
+#: Where pictures of blocks lie; their names end in a digest of what they show.
+PICTURES = "docs/pictures/field"
 _UNDECLARED = (
     "Some of these runs do not say what validation frames served for: they are older than early "
     "stopping for every method."
 )
-#: Where pictures of blocks lie; their names end in a digest of what they show.
-PICTURES = "docs/pictures/field"
 
 _BLOCK = re.compile(r"^<!-- results: ([^\n]+) -->\n(.*?)^<!-- end -->$", re.DOTALL | re.MULTILINE)
 _DIGEST = re.compile(r"<!-- digest: \w{64} -->\s*\Z")
@@ -289,13 +290,13 @@ def _novel_views(rows: Sequence[BoardRow]) -> list[float | None]:
 
 def _facts(rows: Sequence[BoardRow]) -> str:
     """Say how the numbers were made, as a list."""
-    first, days = rows[0].first, sorted({one.started[:10] for row in rows for one in _runs(row)})
+    first, days = rows[0].first, sorted({one.started[:10] for row in rows for one in row.runs})
     frames = sum(len(capture.frames) for capture in first.captures)
     facts = {
         "Captures": f"{len(first.captures)}, with {frames} test frames",
         "Budget": _shared(rows, lambda row: [row.budget]),
         "Seeds": _shared(rows, lambda row: map(str, row.seeds)),
-        "Machine": _shared(rows, lambda row: map(_machine, _runs(row))),
+        "Machine": _shared(rows, lambda row: map(_machine, row.runs)),
         "Cores that a fit used": _cores(rows),
         "Fits that shared their core": _disturbed(rows),
         "Fits beyond their budget": _late(rows),
@@ -348,19 +349,15 @@ def _late(rows: Sequence[BoardRow]) -> str:
     """The rows with fits that took more than a second over their budget, and how many of each."""
     told = []
     for row in rows:
-        limit = row.first.budget.get("seconds")
-        fits = [one.fit_seconds for one in row.captures if limit and one.fit_seconds]
-        if late := [seconds for seconds in fits if limit and seconds > limit + 1.0]:
+        limit = row.first.budget.get("seconds") or math.inf
+        fits = [one.fit_seconds for one in row.captures if one.fit_seconds]
+        if late := [seconds for seconds in fits if seconds > limit + 1.0]:
             told.append(f"{len(late)} of {len(fits)}, up to {max(late):.1f} s ({row.title})")
     return "; ".join(told)
 
 
-def _runs(row: BoardRow) -> list[Results]:
-    return [entry.counted for entry in row.entries]
-
-
 def _environment(row: BoardRow, name: str) -> list[str]:
-    return [str(one.environment.get(name) or "") for one in _runs(row)]
+    return [str(one.environment.get(name) or "") for one in row.runs]
 
 
 def _machine(results: Results) -> str:

@@ -145,8 +145,7 @@ def _avatars(folder: Path, page: MethodPage) -> dict[str, str]:
 def _made_with(row: BoardRow) -> dict[str, str]:
     """Say in words how the numbers of a row were made; empty where it is not known."""
     results, captures = row.first, row.captures
-    runs = [entry.counted for entry in row.entries]
-    told = [provenance(one) for one in runs]
+    told = [provenance(one) for one in row.runs]
     cpu = [capture.cpu_seconds for capture in captures if capture.cpu_seconds is not None]
     seeds = ", ".join(str(seed) for seed in row.seeds)
     return {name: _joined(one[name] for one in told) for name in told[0]} | {
@@ -159,7 +158,7 @@ def _made_with(row: BoardRow) -> dict[str, str]:
         "Seconds on one core": f"{sum(cpu) / len(cpu):.1f} a fit" if cpu else "",
         "Isolation": ", ".join(sorted({one.isolation for one in captures if one.isolation})),
         "Digest of the toolkit's code": _joined(
-            str(one.environment.get("code", "")) for one in runs
+            str(one.environment.get("code", "")) for one in row.runs
         ),
         "Checked": row.level,
         "Badge": row.badge,
@@ -204,11 +203,12 @@ def build_site(
     check_entries(entries)
     if folder.is_dir() and any(folder.iterdir()) and not (folder / "board.js").is_file():
         raise UsageError("holds something else than a leaderboard", where=folder, field="-o")
-    folders = {digest(source.results): source.folder for source in results_folders}
+    given = [(digest(source.results), source.folder) for source in results_folders]
+    folders = dict(given)
     known = {digest(entry.results) for entry in entries}
-    for source in results_folders:
-        if digest(source.results) not in known:
-            notice(f"left out: {source.folder} is of no entry")
+    for content, where in given:
+        if content not in known:
+            notice(f"left out: {where} is of no entry")
     captures = open_captures_of([source.results for source in results_folders])
     with atomic_folder(folder, overwrite=True) as temporary:
         rows = shown_rows(entries)
