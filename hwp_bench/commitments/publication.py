@@ -157,8 +157,7 @@ def _refuse_unscorable(capture: Capture, frames: Iterable[int]) -> None:
     """Refuse, before the commitment, a capture that no evaluation would take after it."""
     refuse_changed(capture, ("frames", "masks", *["true_masks"] * capture.has_true_masks))
     for frame in frames:
-        mask, exact = capture.scoring_mask(frame)
-        if not can_be_scored(mask, coverage=exact):
+        if not can_be_scored(*capture.scoring_mask(frame)):
             problem = f"the mask of frame {frame} leaves no pixel to score"
             raise BadCapture(problem, where=capture.root, field="masks")
 

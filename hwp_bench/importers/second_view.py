@@ -222,7 +222,7 @@ def _common_frames(first: Capture, second: Capture, offset: int) -> tuple[np.nda
         for one, other in pairs
         if all(hand.valid[one] for hand in first.hands.values())
         and all(hand.valid[other] for hand in second.hands.values())
-        and _can_be_scored(second, other)
+        and can_be_scored(*second.scoring_mask(other))
     ]
     if not pairs:
         raise UsageError(
@@ -232,11 +232,6 @@ def _common_frames(first: Capture, second: Capture, offset: int) -> tuple[np.nda
         )
     rows, others = np.array(pairs)[evenly(len(pairs), MOST)].T
     return rows, others
-
-
-def _can_be_scored(capture: Capture, frame: int) -> bool:
-    mask, exact = capture.scoring_mask(frame)
-    return can_be_scored(mask, coverage=exact)
 
 
 def _times(capture: Capture) -> list[int]:

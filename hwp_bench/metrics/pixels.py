@@ -126,7 +126,7 @@ def scored_pixels(mask: np.ndarray, *, erosion: int, coverage: bool = False) -> 
     return cv2.erode(hand.astype(np.uint8), kernel).astype(bool)
 
 
-def can_be_scored(mask: np.ndarray, *, coverage: bool = False) -> bool:
+def can_be_scored(mask: np.ndarray, coverage: bool) -> bool:
     """Whether a mask leaves protocol hwp-v1 a pixel to score; see `scored_pixels`."""
     return bool(scored_pixels(mask, erosion=HWP_V1.mask_erosion, coverage=coverage).any())
 
