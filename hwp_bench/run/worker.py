@@ -17,6 +17,7 @@ import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from types import ModuleType
 from typing import Annotated, Any, TypeAlias
 
 import numpy as np
@@ -179,15 +180,19 @@ def run(training: TrainingCapture, factory: MethodFactory, output: Path, draw: D
 
 def _wait_for_gpu() -> None:
     """Wait for what a GPU was told: that belongs to the fit, not to what is drawn next."""
-    cuda = sys.modules.get("torch.cuda")
-    if cuda is not None and cuda.is_initialized():
+    if (cuda := _used_cuda()) is not None:
         cuda.synchronize()
 
 
 def _used_device() -> str:
     """Return where a method computed that does not say so: on a GPU if torch has used one."""
+    return "cpu" if _used_cuda() is None else "cuda"
+
+
+def _used_cuda() -> ModuleType | None:
+    """Return `torch.cuda` if the method has used a GPU through it; imports nothing."""
     cuda = sys.modules.get("torch.cuda")
-    return "cuda" if cuda is not None and cuda.is_initialized() else "cpu"
+    return cuda if cuda is not None and cuda.is_initialized() else None
 
 
 def render_free_views(avatar: Avatar, training: TrainingCapture, folder: Path, draw: Draw) -> None:
