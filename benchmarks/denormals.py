@@ -86,7 +86,7 @@ def measure() -> Mapping[str, float]:
     """Ratios by name, lower is better: what denormal gradients cost."""
     before = torch.get_num_threads()
     try:
-        return ratios(processor_ms(None, 2_000, 1, 6))
+        return ratios(processor_ms(None, gaussians=2_000, threads=1, rounds=6))
     finally:
         torch.set_num_threads(before)
 
