@@ -33,11 +33,11 @@ class Poses(Component):
         self.remembered = ClipPoses.of(training.hands, believed)
         if self.remembered is not None:
             fit.data.training = training.with_hands(believed)
+            rows = training.train
             fit.data.exact_poses = all(
-                np.array_equal(getattr(hand, name)[training.train], given[training.train])
-                for side, hand in believed.items()
-                for name, given in vars(training.hands[side]).items()
-                if name in ("pose", "transl")
+                np.array_equal(hand.pose[rows], given.pose[rows])
+                and np.array_equal(hand.transl[rows], given.transl[rows])
+                for hand, given in ((believed[side], training.hands[side]) for side in believed)
             )
 
     def before(self, fit: Fit) -> None:
