@@ -60,8 +60,8 @@ class LoopSettings:
     steps: int = number(2_000, 1, 10_000_000)
     #: Frames in each step.
     batch: int = number(1, 1, 64)
-    #: Share of D-SSIM in the loss; the rest is L1.
-    dssim_weight: float = number(0.2, 0.0, 1.0)
+    #: Share of D-SSIM in the loss; the rest is L1. 3DGS has 0.2, which poses must be right for.
+    dssim_weight: float = number(0.05, 0.0, 1.0)
     #: Weight of a pixel outside the visible-hand mask; 1 inside.
     outside_weight: float = number(0.03, 0.0, 1.0)
     #: The steps' size at the end of the budget, as a share of that at its start; in between it
