@@ -13,6 +13,7 @@ their cases are needed.
 from __future__ import annotations
 
 import importlib
+import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -107,6 +108,15 @@ class CaseOutcome:
     backend: str
     measured: Measured
     seconds: float
+
+
+def largest(values: Iterable[float]) -> float:
+    """Return the largest of some numbers, at least one, or NaN where one is NaN.
+
+    The built-in `max` leaves out a NaN that is not the first.
+    """
+    given = list(values)
+    return math.nan if any(map(math.isnan, given)) else max(given)
 
 
 def find_cases(groups: Sequence[str] = (), providers: Sequence[str] = ()) -> list[Case]:

@@ -6,13 +6,16 @@ Oracles and tolerances: the line of each case.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from importlib import import_module
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from hwp_bench.stability import Case, CaseGroup, Context, find_cases
+from hwp_bench.hands.skinning import PosedHand, pose_hand
+from hwp_bench.stability import Case, CaseGroup, Context, find_cases, largest
 
 PROVIDERS = {
     "hands": "hwp_bench.hands.hard_cases",
@@ -77,3 +80,17 @@ def test_cases_notice_what_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
         blocked = "hwp_bench.base.rays.EmbreeMesh.blocked"
         spoilt.setattr(blocked, lambda self, starts, ways: np.zeros(len(starts), dtype=bool))
         assert "light 30 degrees from straight above a plate" in failed("shadows")
+
+
+def test_nan_in_the_second_place_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert math.isnan(largest([1.0, math.nan]))
+    assert math.isnan(largest([math.nan, 1.0]))
+    assert largest(iter([1.0, 3.0, 2.0])) == 3.0
+
+    def with_bad_landmarks(*arguments: Any) -> PosedHand:
+        posed = pose_hand(*arguments)
+        return replace(posed, landmarks=posed.landmarks * math.nan)
+
+    # Vertices are compared first, and are right.
+    monkeypatch.setattr("hwp_bench.hands.hard_cases.pose_hand", with_bad_landmarks)
+    assert {"a template in float16", "every beta at +20"} <= failed("hands")

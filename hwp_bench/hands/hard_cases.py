@@ -18,7 +18,7 @@ from hwp_bench.hands.articulation import axis_angle_to_matrix
 from hwp_bench.hands.skinning import PosedHand, pose_hand, project
 from hwp_bench.hands.sources import load_template
 from hwp_bench.hands.template import TemplateTensors
-from hwp_bench.stability import CaseGroup, Measured
+from hwp_bench.stability import CaseGroup, Measured, largest
 
 #: Largest distance of a vertex from its oracle, m, in float64 and in float32.
 EXACT, ROUNDED = 1e-12, 2e-6
@@ -78,7 +78,7 @@ def _run_huge_pose(size: float, name: str) -> Measured:
     (gradient,) = torch.autograd.grad(posed.vertices.square().sum(), pose)
     turns = axis_angle_to_matrix(pose.detach())
     error = float((turns @ turns.mT - torch.eye(3, dtype=dtype)).abs().amax())
-    error = max(error, float((torch.linalg.det(turns) - 1.0).abs().amax()))
+    error = largest([error, float((torch.linalg.det(turns) - 1.0).abs().amax())])
     finite = bool(posed.vertices.isfinite().all() and gradient.isfinite().all())
     passed = finite and error <= 16.0 * torch.finfo(dtype).eps
     return Measured(passed, f"{'' if finite else 'not finite, '}R R^T off by {error:.0e}")
@@ -102,7 +102,7 @@ def _run_against_float64(beta: float) -> Measured:
         loss = (posed.vertices.flatten() * weights).sum()
         made.append((posed, torch.autograd.grad(loss, leaves)))
     off = _distance(made[0][0], made[1][0])
-    gradient = max(
+    gradient = largest(
         float((ours.double() - truth).norm() / truth.norm())
         for ours, truth in zip(made[0][1], made[1][1], strict=True)
     )
@@ -119,7 +119,8 @@ def _run_linear(beta: float) -> Measured:
         rest, small, large = (
             pose_hand(template, pose, share * one, transl).vertices for share in (0.0, 1.0, beta)
         )
-        worst = max(worst, float((large - rest - beta * (small - rest)).abs().max()))
+        off = (large - rest - beta * (small - rest)).abs()
+        worst = largest([worst, float(off.max())])
     return Measured(worst <= EXACT, f"off by {worst:.0e} m")
 
 
@@ -256,7 +257,7 @@ def _looking(frames: int) -> tuple[Tensor, Tensor]:
 
 def _distance(posed: PosedHand, truth: PosedHand) -> float:
     """Largest distance in any coordinate of any vertex or landmark, m."""
-    return max(
+    return largest(
         float((ours.double() - theirs.double()).detach().abs().max())
         for ours, theirs in (
             (posed.vertices, truth.vertices),

@@ -12,7 +12,7 @@ import numpy as np
 from hwp_bench.base.errors import HwpError
 from hwp_bench.metrics.protocol import HWP_V1, METRICS, PSNR_CAP, metric, penalty
 from hwp_bench.metrics.score import ScoredFrame, score_frame, score_frames
-from hwp_bench.stability import CaseGroup, Measured
+from hwp_bench.stability import CaseGroup, Measured, largest
 
 #: Largest difference from float64 and from scikit-image: dB, and SSIM.
 EXACT, ROUNDED = 1e-9, 1e-9
@@ -50,7 +50,7 @@ _MASKS = tuple(
 def _run_identical(name: str) -> Measured:
     image = _noise(1)
     scores = score_frame(image, image.copy(), _mask(name), coverage=True)
-    off = max(abs(value - metric(key).perfect) for key, value in scores.items())
+    off = largest(abs(value - metric(key).perfect) for key, value in scores.items())
     return Measured(off <= EXACT, f"off by {off:.0e}")
 
 

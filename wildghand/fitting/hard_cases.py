@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hwp_bench.stability import Case, Context, Measured
+from hwp_bench.stability import Case, Context, Measured, largest
 from wildghand.dpd.dpd import DynamicPerturbation, drop
 from wildghand.dpd.temporal import TemporalTarget
 from wildghand.gaussians.attributes import CHANNELS, RawAttributes
@@ -201,8 +201,8 @@ def _run_dropped(context: Context) -> Measured:
     omega = drop(temporal.omega, 1.0, torch.Generator().manual_seed(0))
     biases = module.biases(_attributes(2), temporal.z, omega).concatenate()
     biases.sum().backward()
-    largest = max(_gradient(p) for p in module.parameters())
-    return Measured(bool((biases == 0.0).all()) and largest == 0.0, f"largest {largest:g}")
+    size = largest(_gradient(p) for p in module.parameters())
+    return Measured(bool((biases == 0.0).all()) and size == 0.0, f"largest {size:g}")
 
 
 def _run_omega(omega: float, context: Context) -> Measured:

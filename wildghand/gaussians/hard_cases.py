@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from hwp_bench.stability import CaseGroup, Measured
+from hwp_bench.stability import CaseGroup, Measured, largest
 from wildghand.gaussians.adam import ClippedAdam
 
 #: Largest difference of a parameter from float64, as a share of the step's size.
@@ -69,11 +69,15 @@ def _array(tensor: torch.Tensor) -> np.ndarray:
     return tensor.detach().double().numpy().copy()
 
 
+def _apart(tensor: torch.Tensor, values: np.ndarray) -> float:
+    return float(np.abs(_array(tensor) - values).max())
+
+
 def _gradients(tensors: Sequence[torch.Tensor], size: float, seed: int) -> list[torch.Tensor]:
     generator = torch.Generator().manual_seed(seed)
     made = [torch.randn(tensor.shape, generator=generator) for tensor in tensors]
-    largest = max(float(one.abs().max()) for one in made)
-    return [(one.double() / largest * size).float() for one in made]
+    widest = largest(float(one.abs().max()) for one in made)
+    return [(one.double() / widest * size).float() for one in made]
 
 
 def _follow(sizes: Sequence[float], limit: float) -> Measured:
@@ -87,7 +91,7 @@ def _follow(sizes: Sequence[float], limit: float) -> Measured:
         oracle.step([gradient.numpy() for gradient in given])
         skipped += float(optimizer.take_step(torch.zeros(())))
         pairs = zip(tensors, oracle.values, strict=True)
-        off = max(off, *(float(np.abs(_array(one) - other).max()) for one, other in pairs))
+        off = largest([off, *(_apart(one, other) for one, other in pairs)])
     finite = all(bool(tensor.isfinite().all()) for tensor in tensors)
     share = off / _RATE
     return Measured(finite and not skipped and share <= TOLERANCE, f"off by {share:.0e} of a step")
@@ -152,7 +156,7 @@ def _skip(limit: float, bad: float, loss: float) -> Measured:
             oracle.step([gradient.numpy() for gradient in given])
         said.append(float(optimizer.take_step(torch.tensor(loss if seed == 1 else 0.0))))
     pairs = zip(tensors, oracle.values, strict=True)
-    off = max(float(np.abs(_array(one) - other).max()) for one, other in pairs) / _RATE
+    off = largest(_apart(one, other) for one, other in pairs) / _RATE
     count = float(optimizer.state[tensors[0]]["step"])
     passed = said == [0.0, 1.0, 0.0] and count == 2.0 and off <= TOLERANCE
     return Measured(passed, f"off by {off:.0e} of a step, {count:g} steps counted")
@@ -172,6 +176,6 @@ def _run_absent() -> Measured:
     oracle.step([gradient.numpy() for gradient in given])
     stopped = float(optimizer.take_step(torch.zeros(())))
     pairs = zip(tensors, oracle.values, strict=True)
-    off = max(float(np.abs(_array(one) - other).max()) for one, other in pairs) / _RATE
+    off = largest(_apart(one, other) for one, other in pairs) / _RATE
     passed = not stopped and bool((alone == 1.0).all()) and off <= TOLERANCE
     return Measured(passed, f"off by {off:.0e} of a step")

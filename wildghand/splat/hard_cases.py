@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from hwp_bench.stability import Case, Context, Measured
+from hwp_bench.stability import Case, Context, Measured, largest
 from wildghand.splat.api import rasterize
 
 #: Arguments that have a gradient.
@@ -192,12 +192,12 @@ def _beside_float64(
     truth = draw(scene, "reference", torch.float64, clear)
     drawing = _draw(scene, context, clear, dtype)
     mask = clear.unsqueeze(-1)
-    image = max(
+    image = largest([
         difference(drawing.image * mask, truth.image * mask),
         difference(drawing.alpha * mask, truth.alpha * mask),
-    )
+    ])  # fmt: skip
     gradients = gradient_differences(drawing.gradients, truth)
-    worst = max(gradients, key=lambda name: gradients[name])
+    worst = max(gradients, key=lambda name: (math.isnan(gradients[name]), gradients[name]))
     near = image <= IMAGE_TOLERANCE and gradients[worst] <= tolerance
     passed = drawing.finite and (near or math.isinf(tolerance))
     return Measured(passed, f"image {image:.0e}, gradients {gradients[worst]:.0e} ({worst})")
@@ -213,16 +213,16 @@ def run_no_effect(scene: HardScene, context: Context) -> Measured:
     drawing = _draw(scene, context)
     without = _draw(scene.without(VICTIM), context)
     keep = torch.arange(len(scene.arguments["means"])) != VICTIM
-    own = max(float(drawing.gradients[name][VICTIM].abs().max()) for name in PER_GAUSSIAN)
+    own = largest(float(drawing.gradients[name][VICTIM].abs().max()) for name in PER_GAUSSIAN)
     others = {
         name: value[keep] if name in PER_GAUSSIAN else value
         for name, value in drawing.gradients.items()
     }
-    change = max(
+    change = largest([
         difference(drawing.image, without.image),
         difference(drawing.alpha, without.alpha),
         *gradient_differences(others, without).values(),
-    )
+    ])  # fmt: skip
     passed = drawing.finite and own == 0.0 and change <= NO_CHANGE
     finite = "" if drawing.finite else "not finite, "
     return Measured(passed, f"{finite}its gradient {own:g}, change elsewhere {change:.0e}")
@@ -266,7 +266,7 @@ def run_strided(context: Context) -> Measured:
         for name, value in scene.arguments.items()
     }
     plain, other = _draw(scene, context), _draw(scene.changed(**strided), context)
-    away = max(gradient_differences(other.gradients, plain).values())
+    away = largest(gradient_differences(other.gradients, plain).values())
     # Its gradients are sums of atomic additions, which are not the same twice.
     allowed = NO_CHANGE if context.backend == "gsplat" else 0.0
     same = torch.equal(plain.image, other.image) and away <= allowed
@@ -287,10 +287,7 @@ def run_doubled(context: Context) -> Measured:
     one, two = _draw(single, context), _draw(single.changed(**pair), context)
     expected = 1.0 - (1.0 - one.alpha).square()
     colors = single.arguments["colors"][0]
-    off = max(
-        difference(two.alpha, expected),
-        difference(two.image, expected * colors),
-    )
+    off = largest([difference(two.alpha, expected), difference(two.image, expected * colors)])
     passed = two.finite and off <= IMAGE_TOLERANCE and float(one.alpha.max()) > 0.8
     return Measured(passed, f"off by {off:.0e}, alpha of one up to {float(one.alpha.max()):.2f}")
 
@@ -312,7 +309,7 @@ def run_reordered(context: Context) -> Measured:
         # The nearer of two equal Gaussians is the one of lower index, in both orders.
         first = made[0].gradients[name].unflatten(0, (2, count))
         second = made[1].gradients[name].unflatten(0, (count, 2)).transpose(0, 1)
-        off = max(off, difference(first, second))
+        off = largest([off, difference(first, second)])
     passed = made[0].finite and made[1].finite and off <= GRADIENT_TOLERANCE
     return Measured(passed, f"off by {off:.0e}")
 
@@ -322,7 +319,7 @@ def run_finite(scene: HardScene, context: Context) -> Measured:
     drawing = _draw(scene, context)
     sizes = [float(drawing.gradients[name].abs().max()) for name in DIFFERENTIABLE
              if drawing.gradients[name].numel()]  # fmt: skip
-    return Measured(drawing.finite, f"largest gradient {max(sizes):.0e}")
+    return Measured(drawing.finite, f"largest gradient {largest(sizes):.0e}")
 
 
 _LARGEST = torch.finfo(torch.float32).max
