@@ -224,6 +224,9 @@ def visible_places(
     chosen: dict[str, tuple[str, str]] = {
         "/proc": ("proc", ""),
         "/dev/fd": ("link", "/proc/self/fd"),
+        "/dev/stdin": ("link", "/proc/self/fd/0"),
+        "/dev/stdout": ("link", "/proc/self/fd/1"),
+        "/dev/stderr": ("link", "/proc/self/fd/2"),
     }
     chosen |= dict.fromkeys(SCRATCH, ("scratch", str(scratch)))
     shown = [*_system(), *python_places(), *map(os.fspath, read)]

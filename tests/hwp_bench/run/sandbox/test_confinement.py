@@ -280,3 +280,14 @@ print(json.dumps(sorted(os.path.relpath(os.path.join(top, name), here)
 def test_exposing_what_is_not_there_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="does not exist"):
         run_walled(tmp_path, "print(0)", exposed=(tmp_path / "absent",))
+
+
+def test_standard_streams_have_their_usual_names(tmp_path: Path) -> None:
+    """Shell scripts and programs write to /dev/stderr, and a name that is not there is an error."""
+    script = """
+streams = [os.readlink(f"/dev/{name}") for name in ("stdin", "stdout", "stderr")]
+with open("/dev/stderr", "a") as stream:
+    print("said", file=stream)
+json.dump(streams, sys.stdout)
+"""
+    assert run_walled(tmp_path, script) == [f"/proc/self/fd/{number}" for number in range(3)]
