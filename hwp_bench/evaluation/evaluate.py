@@ -7,7 +7,6 @@ Whatever is wrong with a call is reported before a suite is rendered for minutes
 from __future__ import annotations
 
 import datetime
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -44,15 +43,13 @@ from hwp_bench.metrics import PROTOCOLS
 from hwp_bench.metrics.lpips import load_available
 from hwp_bench.metrics.score import Network
 from hwp_bench.results import CaptureResult, MethodId, Results, write_results
-from hwp_bench.results.schema import environment
+from hwp_bench.results.schema import environment, lifted_steps
 from hwp_bench.run.engine import Engine, LocalEngine, Needs
 from hwp_bench.run.runner import rehearse_method
 from hwp_bench.suites.suite import SuiteCapture, is_ready, suite
 
 #: Most seconds that a method may take to be made before the first capture.
 REHEARSAL_SECONDS = 600.0
-# Steps that no fit of two minutes takes on the hardware of today.
-_LIFTED = 100_000
 #: Called when a capture's work begins, with (index, count, capture id); returns a function that is
 #: then called with (done, total) steps.
 OnCapture = Callable[[int, int, str], Callable[[int, int], None] | None]
@@ -74,13 +71,13 @@ class How(TypedDict, total=False):
 def make_budget(seconds: float | None, steps: int | None) -> Budget:
     """Return the budget that a person asks for; seconds alone lift the method's limit of steps.
 
-    They stand next to more steps than a fit takes in that time, 1,000 a second and at least
-    100,000, so that a result says what it was made with.
+    They stand next to more steps than a fit takes in that time (`lifted_steps`), so that a result
+    says what it was made with.
     """
     asked = Budget(seconds, steps)
     if asked.seconds is None or asked.steps is not None:
         return asked
-    return replace(asked, steps=max(_LIFTED, math.ceil(1_000 * asked.seconds)))
+    return replace(asked, steps=lifted_steps(asked.seconds))
 
 
 def default_folder(method: str, settings: EvaluationSettings) -> Path:

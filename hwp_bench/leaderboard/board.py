@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 from hwp_bench.analysis.columns import Filled, score_column, table_of
 from hwp_bench.analysis.compare import Rank, rank_methods, verdict
 from hwp_bench.analysis.pairing import group_runs, same_but_seed, scope_scores
 from hwp_bench.base.tables import Column, Table
-from hwp_bench.evaluation.evaluate import make_budget
 from hwp_bench.leaderboard.entries import BADGES, LEVELS, Entry
 from hwp_bench.leaderboard.rules import HEADLINE, current, source_of, tables_of, takes_over
 from hwp_bench.leaderboard.suite_data import Severities, on_current_data, suite_severities
@@ -19,7 +17,7 @@ from hwp_bench.metrics import HWP_V1
 from hwp_bench.metrics.score import CaptureScores
 from hwp_bench.report.study_tables import METRIC
 from hwp_bench.results import CaptureResult, Results
-from hwp_bench.results.schema import TRAINING_KINDS, score_rows
+from hwp_bench.results.schema import TRAINING_KINDS, budget_text, score_rows
 from hwp_bench.suites.suite import find_missing
 from hwp_bench.taxonomy import PERTURBATIONS, perturbation
 
@@ -266,19 +264,6 @@ def severities_of(rows: Sequence[BoardRow]) -> list[int]:
 def _mean(values: Sequence[float | None]) -> float | None:
     known = [value for value in values if value is not None]
     return sum(known) / len(known) if known else None
-
-
-def budget_text(budget: Mapping[str, Any]) -> str:
-    """Return a budget in words: `60 s`, `60 s, 900 steps` or `no limit`.
-
-    A limit of steps that seconds alone have lifted (`make_budget`) is left out.
-    """
-    units = {"seconds": "s", "steps": "steps"}
-    seconds = budget.get("seconds")
-    if seconds and budget.get("steps") == make_budget(seconds, None).steps:
-        del units["steps"]
-    parts = [f"{budget[name]:,.15g} {unit}" for name, unit in units.items() if budget.get(name)]
-    return ", ".join(parts) or "no limit"
 
 
 def rankable(rows: Sequence[BoardRow]) -> tuple[list[BoardRow], str]:

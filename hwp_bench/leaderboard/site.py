@@ -21,7 +21,6 @@ from hwp_bench.base.files import atomic_folder, canonical_json
 from hwp_bench.leaderboard.board import (
     SCOPES,
     BoardRow,
-    budget_text,
     method_rows,
     ranks_of,
     severities_of,
@@ -38,7 +37,7 @@ from hwp_bench.report.page import provenance, render_template, style_sheet, writ
 from hwp_bench.report.sources import ResultsSource, open_captures_of
 from hwp_bench.report.study_tables import METRIC
 from hwp_bench.results.published import NOTE, read_published
-from hwp_bench.results.schema import TRAINING_KINDS
+from hwp_bench.results.schema import TRAINING_KINDS, budget_text
 from hwp_bench.taxonomy import SUITE_TEXTS
 
 #: Longest text of a method that is shown, characters.

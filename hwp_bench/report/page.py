@@ -61,7 +61,7 @@ from hwp_bench.report.study_tables import (
 )
 from hwp_bench.report.tables import all_tables, free_view_table, over_seeds, same_data
 from hwp_bench.results import Results
-from hwp_bench.results.schema import add_isolation_note
+from hwp_bench.results.schema import add_isolation_note, budget_text
 from hwp_bench.taxonomy import perturbation
 
 if TYPE_CHECKING:
@@ -137,13 +137,12 @@ def provenance(result: Results) -> dict[str, str]:
     environment = result.environment
     packages = environment.get("packages", {})
     devices = sorted({capture.device for capture in result.captures if capture.device})
-    limits = [f"{value:.15g} {name}" for name, value in result.budget.items() if value]
     return {
         "Method": f"{result.method.title} ({result.method.name}), preset {result.method.preset}",
         "Settings": ", ".join(f"{k} = {v}" for k, v in result.method.settings.items()) or "none",
         "Training data": result.method.training.text,
         "Suite, frames, seed": f"{result.suite}, {result.frames}, {result.seed}",
-        "Budget": ", ".join(limits) or "none",
+        "Budget": budget_text(result.budget),
         "Started": result.started,
         "Device": ", ".join(devices) or "not said",
         "System": f"{environment.get('system', '?')}, {environment.get('processor', '?')}, "

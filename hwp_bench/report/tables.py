@@ -18,6 +18,7 @@ from hwp_bench.results import CaptureResult, FreeViewResult, Results
 from hwp_bench.results.schema import (
     add_isolation_note,
     add_validation_note,
+    budget_text,
     differing_makers,
     differing_settings,
     per_second,
@@ -223,10 +224,7 @@ def _seed(result: Results) -> str:
 _TELLING: tuple[Callable[[Results], str], ...] = (
     lambda result: result.method.preset,
     lambda result: f"{result.frames} frames",
-    lambda result: (
-        ", ".join(f"{value:.15g} {name}" for name, value in result.budget.items() if value)
-        or "no limit"
-    ),
+    lambda result: budget_text(result.budget),
     _seed,
     lambda result: result.method.digest[:8],
 )

@@ -52,6 +52,8 @@ Limits = dict[_Limit, Count | Seconds | None]
 FreeTable = dict[Line, Any]
 # Longest text of a setting's value.
 _SHOWN = 40
+# Steps that no fit of two minutes takes on the hardware of today.
+_LIFTED = 100_000
 #: What `CaptureResult.isolation` says of a run inside the sandbox.
 ISOLATED = "namespaces"
 #: What `Results.environment` says under `caches`: a run finds nothing that a method wrote before.
@@ -344,6 +346,26 @@ def check_table(value: Mapping[str, Any], name: str) -> None:
     """Refuse a table of any values that is too large to be shown."""
     if len(json.dumps(value)) > MAX_TABLE:
         raise UsageError(f"holds more than {MAX_TABLE:,} characters", field=name)
+
+
+def lifted_steps(seconds: float) -> int:
+    """Return the limit of steps beside a budget in seconds alone: more than a fit takes in them.
+
+    These are 1,000 a second, and at least 100,000.
+    """
+    return max(_LIFTED, math.ceil(1_000 * seconds))
+
+
+def budget_text(budget: Mapping[str, Any]) -> str:
+    """Return a budget in words: `60 s`, `60 s, 900 steps` or `no limit`.
+
+    A limit of steps that seconds alone have lifted (`lifted_steps`) is left out.
+    """
+    seconds, steps = budget.get("seconds"), budget.get("steps")
+    if seconds and steps == lifted_steps(seconds):
+        steps = None
+    limits = ((seconds, "s"), (steps, "steps"))
+    return ", ".join(f"{value:,.15g} {unit}" for value, unit in limits if value) or "no limit"
 
 
 def per_second(count: int, seconds: float | None) -> float | None:

@@ -21,7 +21,7 @@ from hwp_bench.base.files import sha256_json
 from hwp_bench.base.images import write_image
 from hwp_bench.capture import Capture
 from hwp_bench.capture.schema import frame_name
-from hwp_bench.leaderboard.board import BoardRow, board_rows, budget_text
+from hwp_bench.leaderboard.board import BoardRow, board_rows
 from hwp_bench.leaderboard.entries import Entry, Submission, entry_name, make_entry
 from hwp_bench.leaderboard.site import (
     build_site,
@@ -34,6 +34,7 @@ from hwp_bench.methods.manifest import shipped_methods
 from hwp_bench.metrics import PROTOCOLS
 from hwp_bench.report.sources import ResultsSource
 from hwp_bench.results import FrameResult, TrainingData
+from hwp_bench.results.schema import budget_text
 
 EVIL = '"><img src=x onerror=alert(1)>'
 

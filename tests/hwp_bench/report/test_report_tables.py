@@ -318,5 +318,5 @@ def test_a_mean_over_seeds_is_not_called_by_one_of_them() -> None:
         budget = {"seconds": seconds, "steps": None}
         found.append(made_results("mine", lambda c, f, s: 20.0 + c, seed=seed, budget=budget))
     table = over_seeds(all_tables(found)["overall"], found)
-    assert [row[0] for row in table.rows] == ["Mine (30 seconds)", "Mine (60 seconds)"]
+    assert [row[0] for row in table.rows] == ["Mine (30 s)", "Mine (60 s)"]
     assert "added up" in table.notes[-1]
