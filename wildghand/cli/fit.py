@@ -78,7 +78,7 @@ def _add_fit(parser: argparse.ArgumentParser) -> None:
     add("--size", type=int, metavar="PX", help=size)
     add_fitting(parser, "optimizer steps")
     add("--budget", type=float, metavar="SECONDS", help="limit of the fit's time")
-    frames = "fit validation and test frames too (default: for a video yes, for a capture no)"
+    frames = "fit all but the last twentieth (default: for a video yes, for a capture no)"
     add("--all-frames", action=argparse.BooleanOptionalAction, help=frames)
     prior = "start from it (made by `wildghand pretrain`; default: the one that ships)"
     add("--prior", type=Path, metavar="PRIOR", help=prior)

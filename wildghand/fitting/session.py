@@ -131,7 +131,7 @@ def fit_capture(
     if out is not None and kept and not (Path(out) / CALL).is_file():
         raise exists
     capture = open_capture(source)
-    split = every_frame(capture) if all_frames else _split(capture)
+    split = every_frame(capture, tested_frames(capture)) if all_frames else _split(capture)
     if out is None:
         with tempfile.TemporaryDirectory() as folder:
             avatar = _fit_in(Path(folder), capture, split, run, world, watch, save=False)
@@ -326,8 +326,17 @@ def _split(capture: Capture) -> Split:
         ) from error
 
 
-def every_frame(capture: Capture) -> Split:
-    """Every frame but the last two, which stand for the parts that a split must have."""
+# Frames at the end of a clip that a fit of all frames is tested with: a twentieth, at most 12.
+_TESTED_SHARE, _MOST_TESTED = 20, 12
+
+
+def tested_frames(capture: Capture) -> int:
+    """Return how many of a clip's last frames a fit of all frames leaves out, to be tested."""
+    return max(1, min(_MOST_TESTED, capture.info.frame_count // _TESTED_SHARE))
+
+
+def every_frame(capture: Capture, tested: int = 1) -> Split:
+    """Every frame but the last: one stands for validation, and some are there to test the fit."""
     count = capture.info.frame_count
     if count < 3:
         raise BadInput(
@@ -335,4 +344,5 @@ def every_frame(capture: Capture) -> Split:
             where=capture.root,
             field="frame_count",
         )
-    return Split(capture.info.id, count, (0, count - 2), (count - 2, count - 1), (count - 1, count))
+    first = count - tested
+    return Split(capture.info.id, count, (0, first - 1), (first - 1, first), (first, count))

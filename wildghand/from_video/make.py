@@ -231,8 +231,8 @@ def fit(
         seconds: limit of the fit, s.
         steps: limit of the fit in optimizer steps.
         seed: seed of all random numbers.
-        all_frames: fit the validation and test frames too: for an avatar, not for a score. None:
-            those of a video, not those of a capture.
+        all_frames: fit the validation and test frames too, but for the last twentieth, at most 12:
+            for an avatar, not for a score. None: those of a video, not those of a capture.
         overwrite: replace an avatar that is there.
         side: of a video: `right`, `left`, `both` or `auto` (the default: one or both, as it shows).
         landmarks: of a video: its landmarks; None tracks them.

@@ -85,7 +85,7 @@ class VideoFit:
     tracker: Path | None = None
     #: An avatar in about half of the time: fewer frames, Gaussians and steps.
     quick: bool = False
-    #: Fit every frame. False leaves the last fifth out, for a score.
+    #: Fit all frames but the last twentieth. False leaves the last fifth out, for a score.
     all_frames: bool = True
     #: Edge of the square frames that are fitted, px.
     size: int = VideoImport.size

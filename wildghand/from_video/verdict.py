@@ -25,6 +25,7 @@ from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.hands.skeleton import palm_directions
 from hwp_bench.metrics.score import score_frame
 from wildghand.avatar.avatar import WildGHandAvatar
+from wildghand.fitting.session import every_frame, tested_frames
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import HandRig
 from wildghand.gaussians.training import TrainingClip
@@ -32,6 +33,8 @@ from wildghand.visibility import shown_frames
 
 # Frames that the surface is looked for in, and drawn ones that are scored.
 _LOOKED_AT, _SCORED = 120, 12
+# Kept-out frames with a hand that are needed; with fewer, fitted ones are scored.
+_LEAST_SCORED = 3
 # Frames that must show a place.
 _SEEN = 2.0
 # Cosine between the normal of a place at rest and a direction from which on it is of that part.
@@ -147,12 +150,14 @@ def parts_of(rig: HandRig, side: str) -> dict[str, np.ndarray]:
 
 
 def _score(avatar: WildGHandAvatar, capture: Capture) -> tuple[float | None, int, Any]:
-    """PSNR over the test frames if the fit has not seen them, else over fitted frames."""
-    test = contiguous_split(capture.info.id, len(capture)).test
-    test = test[np.all([capture.hands[side].valid[test] for side in avatar.sides], axis=0)]
-    # A fit of every frame leaves the last two as well.
-    kept_out = len(test) > 2 and not set(test.tolist()) & set(avatar.record.frames)
-    frames = np.array(test if kept_out else avatar.record.frames)
+    """PSNR over frames at the end that the fit has not seen, else over fitted ones."""
+    frames, kept_out = np.array(avatar.record.frames), False
+    whole = every_frame(capture, tested_frames(capture))
+    for split in (whole, contiguous_split(capture.info.id, len(capture))):
+        valid = [capture.hands[side].valid[split.test] for side in avatar.sides]
+        test = split.test[np.all(valid, axis=0)]
+        if len(test) >= _LEAST_SCORED and not np.isin(test, avatar.record.frames).any():
+            frames, kept_out = test, True
     found = []
     for frame in frames[evenly(len(frames), _SCORED)].tolist():
         poses = {side: capture.hand_poses(frame)[side] for side in avatar.sides}

@@ -30,18 +30,19 @@ FIT = {"reprojection_px": {"mean": 3.25}, "frames_valid": FRAMES, "frames_detect
 
 def film(place: Path, behind: Sequence[bool], side: str = "right", fit: Any = FIT) -> Capture:
     """A capture whose frames show the palm, or from `behind` the back; every pixel is hand."""
-    clip, scale = make_clip(FRAMES, side=side, bend=0.2), EDGE / HEIGHT
+    frames = len(behind)
+    clip, scale = make_clip(frames, side=side, bend=0.2), EDGE / HEIGHT
     K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1 / scale]]) * scale
     K[0, 2] = K[1, 2] = EDGE / 2
     info = CaptureInfo(
         id="filmed", hands=side, action="turning", device="none", fps=30.0, width=EDGE,
-        height=EDGE, frame_count=FRAMES, hand_model=free_hand(side), perturbations={},
+        height=EDGE, frame_count=frames, hand_model=free_hand(side), perturbations={},
         source={"kind": "test", "fit": fit}, licence="CC0",
     )  # fmt: skip
     viewmats = np.stack([BEHIND if turned else np.eye(4) for turned in behind])
-    cameras = Cameras(np.tile(K, (FRAMES, 1, 1)), viewmats)
+    cameras = Cameras(np.tile(K, (frames, 1, 1)), viewmats)
     with CaptureWriter(place, info, {side: clip.hand}, cameras) as writer:
-        for frame in range(FRAMES):
+        for frame in range(frames):
             writer.frame(frame, np.full((EDGE, EDGE, 3), 90 + frame, np.uint8))
             writer.mask(frame, np.full((EDGE, EDGE), 255, np.uint8))
     return open_capture(place)
@@ -96,6 +97,15 @@ def test_frames_that_were_kept_out_are_scored(tmp_path: Path) -> None:
     assert f"{verdict.psnr:.1f} dB on 3 kept out frames" in said
     (tmp_path / "verdict.json").write_text(json.dumps(asdict(verdict)))
     assert read_verdict(tmp_path / "verdict.json") == verdict
+
+
+def test_a_fit_of_all_frames_is_tested_with_the_last_twentieth(tmp_path: Path) -> None:
+    capture = film(tmp_path / "capture", [False] * 60)
+    avatar = wildghand.fit(capture.root, settings=UNJUDGED, steps=2, all_frames=True)
+    # One stands for validation, which has too few frames to choose by.
+    assert avatar.record.frames == list(range(56))
+    verdict = judge_avatar(avatar, capture)
+    assert (verdict.psnr_of, verdict.psnr_frames) == ("kept out", 3)
 
 
 def test_the_surface_is_counted_in_the_corrected_poses(tmp_path: Path) -> None:
