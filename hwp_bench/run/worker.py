@@ -14,8 +14,9 @@ import resource
 import sys
 import time
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Any, TypeAlias
@@ -130,7 +131,10 @@ Draw: TypeAlias = Callable[[Avatar, Mapping[str, HandPose], Camera, str], np.nda
 
 
 def run(training: TrainingCapture, factory: MethodFactory, output: Path, draw: Draw) -> None:
-    """Fit, render the targets, and write predictions, checkpoints and `run.json`."""
+    """Fit, render the targets, and write predictions, checkpoints and `run.json`.
+
+    A frame that cannot be rendered costs only itself, as long as there are others.
+    """
     validation = training.validation
     frames = validation[evenly(len(validation), CHECKPOINT_FRAMES)].tolist()
 
@@ -138,9 +142,7 @@ def run(training: TrainingCapture, factory: MethodFactory, output: Path, draw: D
         return draw(avatar, training.hand_poses(frame), training.camera(frame), f"frame {frame}")
 
     def record(index: int, avatar: Avatar) -> None:
-        for frame in frames:
-            folder = checkpoint_folder(output, index)
-            write_image(folder / frame_name(frame), render(avatar, frame))
+        _write_frames(frames, partial(render, avatar), checkpoint_folder(output, index))
 
     entered = time.perf_counter()
     method = factory(training.run.settings, training.run.seed)
@@ -155,12 +157,8 @@ def run(training: TrainingCapture, factory: MethodFactory, output: Path, draw: D
     if callable(explain):
         explain(output / DIAGNOSTICS)
     report.take(final_step, avatar, fit_seconds)
-    render_seconds = 0.0
-    for frame in training.targets.tolist():
-        started = time.perf_counter()
-        pixels = render(avatar, frame)
-        render_seconds += time.perf_counter() - started
-        write_image(output / PREDICTIONS / frame_name(frame), pixels)
+    targets = training.targets.tolist()
+    render_seconds = _write_frames(targets, partial(render, avatar), output / PREDICTIONS)
     render_free_views(avatar, training, output / FREE_VIEW, draw)
     facts = RunFacts(
         fit_seconds=fit_seconds,
@@ -176,6 +174,38 @@ def run(training: TrainingCapture, factory: MethodFactory, output: Path, draw: D
         checkpoints=report.checkpoints,
     )
     write_json(output / RUN, asdict(facts))
+
+
+def _write_frames(
+    frames: Sequence[int],
+    render: Callable[[int], np.ndarray],
+    folder: Path,
+    *,
+    needed: bool = True,
+) -> float:
+    """Write each frame that can be rendered; what is wrong with others goes to the log.
+
+    Args:
+        needed: raise the last frame's exception where none can be rendered.
+
+    Returns:
+        Seconds of rendering.
+    """
+    seconds, failed = 0.0, 0
+    for frame in frames:
+        started = time.perf_counter()
+        try:
+            pixels = render(frame)
+        except Exception:
+            failed += 1
+            if needed and failed == len(frames):
+                raise
+            traceback.print_exc()
+            continue
+        finally:
+            seconds += time.perf_counter() - started
+        write_image(folder / frame_name(frame), pixels)
+    return seconds
 
 
 def _wait_for_gpu() -> None:
@@ -200,15 +230,12 @@ def render_free_views(avatar: Avatar, training: TrainingCapture, folder: Path, d
     views = training.free_views
     if views is None:
         return
-    for frame in range(len(views)):
-        hands = views.hand_poses(frame)
+
+    def render(frame: int) -> np.ndarray:
         camera = views.cameras.camera(frame, training.width, training.height)
-        try:
-            pixels = draw(avatar, hands, camera, f"free-view frame {frame}")
-        except Exception:
-            traceback.print_exc()
-            continue
-        write_image(folder / frame_name(frame), pixels)
+        return draw(avatar, views.hand_poses(frame), camera, f"free-view frame {frame}")
+
+    _write_frames(range(len(views)), render, folder, needed=False)
 
 
 def render_checked(

@@ -169,6 +169,22 @@ def test_crashes_are_named(request_folder: Path, tmp_path: Path, body: str, prob
         _run(manifest, request_folder, tmp_path)
 
 
+def test_a_frame_that_cannot_be_rendered_costs_only_itself(
+    request_folder: Path, tmp_path: Path
+) -> None:
+    body = """
+        last, colour = training.hand_poses(19), total / len(training.train)
+        def render(self, hands, camera):
+            same = all(np.array_equal(hands[side].pose, last[side].pose) for side in last)
+            return np.full((camera.height, camera.width, 3), np.nan if same else 0.5)
+        Avatar.render = render"""
+    record = _run(python_method(tmp_path / "m", body.lstrip()), request_folder, tmp_path)
+    found = [read_prediction(record.predictions, frame, (32, 32)) for frame in (18, 19)]
+    assert (found[0].pixels == 128).all()
+    assert found[1].pixels is None
+    assert "frame 19: render returned NaN" in (tmp_path / "output" / "log.txt").read_text()
+
+
 def test_a_method_that_hangs_is_stopped(request_folder: Path, tmp_path: Path) -> None:
     method = command_method(tmp_path / "m", "import time; time.sleep(600)")
     with pytest.raises(MethodFailed, match=r"ran out of time on tiny after 1\.5 s"):
