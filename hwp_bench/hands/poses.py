@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib import resources
 from types import MappingProxyType
@@ -12,7 +12,14 @@ from types import MappingProxyType
 import numpy as np
 
 from hwp_bench.base.errors import BadInput
-from hwp_bench.hands.skeleton import FINGERS, PARENTS, finger_joints, landmark_order, moved_joints
+from hwp_bench.hands.skeleton import (
+    FINGERS,
+    PARENTS,
+    HandParameters,
+    finger_joints,
+    landmark_order,
+    moved_joints,
+)
 from hwp_bench.hands.template import HandTemplate
 
 #: First joint of each finger in MANO's order.
@@ -227,6 +234,32 @@ def turned(pose: np.ndarray, turn: np.ndarray) -> np.ndarray:
     other = vectors * (1.0 - 2.0 * np.pi / np.maximum(angles, 1e-9))
     nearer = np.linalg.norm(other - pose, axis=-1) < np.linalg.norm(vectors - pose, axis=-1)
     return np.where(nearer[..., None], other, vectors)
+
+
+def filled(hand: HandParameters) -> HandParameters:
+    """Interpolate the parameters of frames that are not valid, so that the hand can be drawn there.
+
+    Joints turn the shortest way between the valid frames around (slerp), and the place goes
+    straight; before the first valid frame and after the last they stand still. Valid frames, and
+    which these are, stay as they are.
+    """
+    from scipy.spatial.transform import Rotation, Slerp
+
+    seen = np.flatnonzero(hand.valid)
+    if len(seen) in (0, hand.frame_count):
+        return hand
+    frames = np.arange(hand.frame_count).clip(seen[0], seen[-1])
+    pose, transl = hand.pose.copy(), hand.transl.copy()
+    lost = ~hand.valid
+    # The last one twice, since an interpolation needs two.
+    known = np.append(seen, seen[-1])
+    times = np.append(seen, seen[-1] + 1)
+    for joint in range(pose.shape[1]):
+        turns = Slerp(times, Rotation.from_rotvec(hand.pose[known, joint]))
+        pose[lost, joint] = turns(frames[lost]).as_rotvec()
+    for axis in range(3):
+        transl[lost, axis] = np.interp(frames[lost], seen, hand.transl[seen, axis])
+    return replace(hand, pose=pose, transl=transl)
 
 
 def _moved_by(joint: int) -> np.ndarray:

@@ -27,6 +27,7 @@ from hwp_bench.capture.folder import refuse_taken
 from hwp_bench.capture.schema import MAX_FRAMES
 from hwp_bench.hands import HandParameters, HandTemplate, load_template
 from hwp_bench.hands.fitting import FitTargets
+from hwp_bench.hands.poses import filled
 from hwp_bench.hands.raster import draw_silhouette
 from hwp_bench.hands.skinning import pose_parameters
 from hwp_bench.importers.shared.frames import CropWindows, cut, follow_hands, resample
@@ -410,7 +411,8 @@ def import_interhand(
     hands: dict[str, HandParameters] = {}
     errors: dict[str, dict[str, Any]] = {}
     for side, template in templates.items():
-        hands[side], errors[side] = _import_hand(records, template, options, root)
+        hand, errors[side] = _import_hand(records, template, options, root)
+        hands[side] = filled(hand)
     viewmats = np.tile(records.viewmat, (count, 1, 1))
 
     def projected(Ks: np.ndarray) -> list[ProjectedHand]:

@@ -39,7 +39,7 @@ from hwp_bench.capture.folder import refuse_taken
 from hwp_bench.capture.schema import check_id
 from hwp_bench.hands import HandParameters, HandTemplate, load_template
 from hwp_bench.hands.fitting import FitTargets, FittedHand
-from hwp_bench.hands.poses import mirrored
+from hwp_bench.hands.poses import filled, mirrored
 from hwp_bench.hands.skinning import pose_parameters
 from hwp_bench.hands.sources import FINGERTIPS
 from hwp_bench.importers.official.records import (
@@ -323,7 +323,7 @@ def import_official(
     entry = catalogue().get(folder.id)
     write_capture(
         out,
-        {side: made.parameters for side, made in hands.items()},
+        {side: filled(made.parameters) for side, made in hands.items()},
         cameras,
         ((crop.image, crop.mask) for crop in crops),
         list(clips.values()),

@@ -8,8 +8,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hwp_bench.hands import load_template, pose_hand
-from hwp_bench.hands.poses import hand_extent, movement, posed_skeleton, rest_skeleton, turned
+from hwp_bench.hands import HandParameters, load_template, pose_hand
+from hwp_bench.hands.poses import (
+    filled,
+    hand_extent,
+    movement,
+    posed_skeleton,
+    rest_skeleton,
+    turned,
+)
 
 
 @pytest.mark.parametrize("side", ["right", "left"])
@@ -62,3 +69,22 @@ def test_the_extent_is_the_longer_side_in_slopes() -> None:
     points[:, 0, 0], points[:, 1, 1] = 0.2, 0.1
     # Slopes of 0.4, 0.2 and 0.1; the middle frame's counts.
     assert hand_extent(points) == pytest.approx(0.2)
+
+
+def test_frames_without_a_hand_are_filled_from_those_around() -> None:
+    """Oracle: turns about one axis, whose angles are linear in time."""
+    angles = np.array([9.0, 0.2, 9.0, 9.0, 0.8, 0.5, 9.0])
+    valid = angles < 9.0
+    pose = angles[:, None, None] * np.tile([0.0, 0.6, 0.8], (16, 1))
+    transl = angles[:, None] * np.array([1.0, 2.0, 3.0])
+    hand = filled(HandParameters(pose, np.zeros(10), transl, valid))
+    wanted = np.array([0.2, 0.2, 0.4, 0.6, 0.8, 0.5, 0.5])
+    np.testing.assert_allclose(np.linalg.norm(hand.pose, axis=-1), wanted[:, None].repeat(16, 1))
+    np.testing.assert_allclose(hand.transl, wanted[:, None] * [1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(hand.valid, valid)
+    np.testing.assert_array_equal(hand.pose[valid], pose[valid])
+    one = filled(HandParameters(pose, np.zeros(10), transl, np.arange(7) == 4))
+    np.testing.assert_allclose(one.pose, pose[[4] * 7])
+    for same in (np.ones(7, bool), np.zeros(7, bool)):
+        whole = HandParameters(pose, np.zeros(10), transl, same)
+        assert filled(whole) is whole
