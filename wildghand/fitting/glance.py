@@ -1,4 +1,4 @@
-"""A look at a fit while it runs: one training frame, the avatar in its place, the pixel weights.
+"""A look at a fit while it runs: a training frame, the avatar in its place and turned, the weights.
 
 Looking changes nothing: a fit that is watched gives the same bits as one that is not.
 """
@@ -20,8 +20,10 @@ from wildghand.fitting.weights import Pao
 from wildghand.gaussians.fit_loop import Loss
 from wildghand.splat.threads import denormals_flushed
 
-#: Least seconds between two pictures, and the largest share of the time that goes into them.
+#: Least seconds between two looks, and the largest share of the time that goes into them.
 LEAST_PAUSE, SHARE = 1.0, 0.1
+#: Looks in which the avatar turns once.
+LOOKS_PER_TURN = 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,12 +44,18 @@ class Glance:
     avatar: np.ndarray
     #: (H, W) uint8: how much each pixel counts, 255 for the largest weight.
     weights: np.ndarray
+    #: (H, W, 3) uint8 over black: the avatar in the frame's pose, seen from around it.
+    turned: np.ndarray
 
 
 @denormals_flushed()
 @torch.no_grad()
-def glance(fit: Fit, row: int, step: int, loss: float) -> Glance:
-    """Look at one of the frames that are fitted."""
+def glance(fit: Fit, row: int, step: int, loss: float, angle: float = 0.0) -> Glance:
+    """Look at one of the frames that are fitted.
+
+    Args:
+        angle: rad, of the camera about the hands for the turned picture.
+    """
     batch, pao, training = StepBatch(torch.tensor([row])), fit.part(Pao), fit.data.training
     # Weighing a frame moves the running medians along.
     before = {} if pao is None else pao.state_dict()
@@ -71,7 +79,32 @@ def glance(fit: Fit, row: int, step: int, loss: float) -> Glance:
         truth=truth,
         avatar=as_uint8(image),
         weights=(255.0 * share).round().byte().cpu().numpy(),
+        turned=_turned(fit, row, angle),
     )
+
+
+def _turned(fit: Fit, row: int, angle: float) -> np.ndarray:
+    """Draw the avatar in a frame's pose from a camera that is turned about the hands, upright."""
+    clip, training, rows = fit.clip, fit.data.training, torch.tensor([row], device=fit.device)
+    viewmat = clip.viewmats[row].double()
+    middle = clip.poses(rows).positions[0].double().mean(dim=0)
+    seen = viewmat[:3, :3] @ middle + viewmat[:3, 3]
+    cos, sin = math.cos(angle), math.sin(angle)
+    about = torch.eye(4, dtype=torch.float64, device=fit.device)
+    about[0, 0], about[0, 2], about[2, 0], about[2, 2] = cos, sin, -sin, cos
+    about[:3, 3] = seen - about[:3, :3] @ seen
+    image, _ = fit.model.draw(
+        {
+            side: (pose[rows], betas, transl[rows])
+            for side, (pose, betas, transl) in clip.parameters.items()
+        },
+        (about @ viewmat).float()[None],
+        clip.Ks[rows],
+        training.width,
+        training.height,
+        refine=fit.settings.heads,
+    )
+    return as_uint8(image[0].clamp(0.0, 1.0).nan_to_num(0.0).float().cpu().numpy())
 
 
 def _psnr(image: np.ndarray, truth: np.ndarray, hand: np.ndarray) -> float:
@@ -99,7 +132,7 @@ class Live:
         pause: float = LEAST_PAUSE,
     ) -> None:
         self._show, self._wanted, self._row, self._pause = show, wanted, row, pause
-        self._due = 0.0
+        self._due, self._looks = 0.0, 0
 
     def __call__(self, fit: Fit, step: int, loss: Loss) -> None:
         """Look, where it is time to."""
@@ -107,7 +140,9 @@ class Live:
         if began < self._due or not self._wanted():
             return
         try:
-            self._show(glance(fit, self._row(len(fit.data.frames)), step, float(loss)))
+            angle = math.tau * self._looks / LOOKS_PER_TURN
+            self._show(glance(fit, self._row(len(fit.data.frames)), step, float(loss), angle))
+            self._looks += 1
         except OSError as error:  # the network's: a page that is gone must not end a fit
             notice(f"The fit cannot be shown ({error}).")
         now = time.monotonic()

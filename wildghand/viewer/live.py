@@ -19,22 +19,24 @@ if TYPE_CHECKING:
     from viser import ClientHandle, GlbHandle, ViserServer
 
 
-#: Larger side of each of the three pictures, px.
+#: Larger side of each of the four pictures, px.
 TILE = 384
 _GAP = 8
 
 
 def live_sheet(look: Glance, aspect: float) -> np.ndarray:
-    """Draw the three pictures of a preview on a sheet, (H, W, 3) uint8; W is `aspect` times H."""
-    names = (f"frame {look.frame}", f"avatar, {look.psnr:.1f} dB", "weights of pixels")
-    pictures = (look.truth, look.avatar, np.repeat(look.weights[..., None], 3, axis=2))
+    """Draw the four pictures of a preview on a sheet, (H, W, 3) uint8; W is `aspect` times H."""
+    names = (f"frame {look.frame}", f"avatar, {look.psnr:.1f} dB", "turned", "weights of pixels")
+    weights = np.repeat(look.weights[..., None], 3, axis=2)
+    pictures = (look.truth, look.avatar, look.turned, weights)
     room = ((_GAP, _GAP), (_GAP, _GAP), (0, 0))
     tiles = [
         np.pad(labelled(fitted(image, TILE), name), room, constant_values=PAPER[0])
         for image, name in zip(pictures, names, strict=True)
     ]
-    rows = [np.concatenate(tiles, axis=axis) for axis in (1, 0)]
-    inner = max(rows, key=lambda line: min(aspect / line.shape[1], 1.0 / line.shape[0]))
+    pairs = [np.concatenate(tiles[first : first + 2], axis=1) for first in (0, 2)]
+    laid = [*(np.concatenate(tiles, axis=axis) for axis in (1, 0)), np.concatenate(pairs)]
+    inner = max(laid, key=lambda whole: min(aspect / whole.shape[1], 1.0 / whole.shape[0]))
     height, width = inner.shape[:2]
     full = max(height, round(width / aspect)), max(width, round(height * aspect))
     top, left = (full[0] - height) // 2, (full[1] - width) // 2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from painted import SilentReport, TrainingMaker
+from scipy.spatial.transform import Rotation
 from tiny_fits import UNJUDGED
 
 from hwp_bench.capture import Capture
@@ -67,6 +69,44 @@ def test_a_glance_shows_the_frame_the_avatar_and_the_weights(make_training: Trai
     assert np.abs(last.avatar[hand] / 255.0 - drawn[hand]).mean() < 0.03
     assert last.weights.max() == 255
     assert last.weights[hand].mean() > 2.0 * last.weights[~hand].mean()
+
+
+def test_the_turned_picture_is_that_of_a_camera_around_the_hand(
+    make_training: TrainingMaker,
+) -> None:
+    """Oracles: the avatar from the frame's own camera, and from a camera turned by hand."""
+    training = make_training()
+    fit = make_fit(training, read_settings({**QUICK, "schedule.steps": 30}), 0, torch.device("cpu"))
+    avatar = run_fit(fit, Budget(), SilentReport())
+    frame = int(training.train[2])
+    hands, camera = training.hand_poses(frame), training.camera(frame)
+    for angle in (0.0, 0.5, np.pi):
+        turned = glance(fit, 2, 30, 0.5, angle).turned / 255.0
+        positions = fit.clip.poses(torch.tensor([2])).positions[0].double().numpy()
+        middle = camera.viewmat[:3, :3] @ positions.mean(axis=0) + camera.viewmat[:3, 3]
+        turn = Rotation.from_euler("y", angle).as_matrix()
+        viewmat = camera.viewmat.copy()
+        viewmat[:3, :3] = turn @ camera.viewmat[:3, :3]
+        viewmat[:3, 3] = turn @ (camera.viewmat[:3, 3] - middle) + middle
+        drawn = avatar.render(hands, dataclasses.replace(camera, viewmat=viewmat))[..., :3]
+        assert np.abs(turned - drawn).max() < 0.01
+        assert (turned.max(axis=-1) > 0.1).mean() > 0.02
+
+
+def test_the_avatar_turns_with_each_look(
+    make_training: TrainingMaker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fit = make_fit(make_training(), read_settings(QUICK), 0, torch.device("cpu"))
+    angles: list[float] = []
+
+    def look(fit: Fit, row: int, step: int, loss: float, angle: float) -> None:
+        angles.append(angle)
+
+    monkeypatch.setattr("wildghand.fitting.glance.glance", look)
+    live = Live(lambda look: None, pause=0.0)
+    for step in range(25):
+        live(fit, step, 0.1)
+    assert np.allclose(np.diff(angles), np.deg2rad(15.0))
 
 
 def test_the_clock_of_a_fit_stands_still_while_it_is_watched(
