@@ -40,7 +40,7 @@ from zero_mean_exposure_fit.method import (
     start_controller,
 )
 
-SETTINGS = {**QUICK, "steps": 200, "frame_rate": 0.1}
+SETTINGS = {**QUICK, "steps": 200, "frame_rate": 0.1, "dssim_weight": 0.2}
 
 
 def some_image() -> torch.Tensor:
