@@ -349,7 +349,7 @@ def check_table(value: Mapping[str, Any], name: str) -> None:
 
 
 def lifted_steps(seconds: float) -> int:
-    """Return the limit of steps beside a budget in seconds alone: more than a fit takes in them.
+    """Return the limit of steps next to one in seconds alone: more than a fit takes in them.
 
     These are 1,000 a second, and at least 100,000.
     """

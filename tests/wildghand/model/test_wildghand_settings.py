@@ -179,11 +179,13 @@ def test_the_mode_of_the_bare_network_is_all_that_network_scratch_changes() -> N
     off = {name for name in EVERY if value_of(made, name) != EVERY[name]}
     idle = {"prepass.frame_poses", "dpd.additions"}
     assert off - idle == {name for name, _ in flattened(MODES["bare"])}
-    # Every baseline has the choice of an earlier state; the resolution is the best of its trials.
+    # Every baseline has the choice of an earlier state and this share of D-SSIM; the resolution is
+    # the best of its trials.
     assert read_manifest(find_method("baselines/network-scratch")).presets["default"] == {
         "mode": "bare",
         "schedule": {"validated": True},
         "network": {"identity_resolution": 80},
+        "terms": {"dssim_weight": 0.05},
     }
 
 
