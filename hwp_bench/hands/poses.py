@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from importlib import resources
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,6 +22,9 @@ from hwp_bench.hands.skeleton import (
     moved_joints,
 )
 from hwp_bench.hands.template import HandTemplate
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 #: First joint of each finger in MANO's order.
 FIRST_JOINT = MappingProxyType({finger: finger_joints(finger)[0] for finger in FINGERS})
@@ -236,29 +240,38 @@ def turned(pose: np.ndarray, turn: np.ndarray) -> np.ndarray:
     return np.where(nearer[..., None], other, vectors)
 
 
+def interpolate(values: np.ndarray, seen: np.ndarray, count: int) -> np.ndarray:
+    """Fill values (S, ...) of frames `seen`, ascending, to (F, ...): linearly, ends held."""
+    flat = values.reshape(len(seen), -1)
+    columns = [np.interp(np.arange(count), seen, column) for column in flat.T]
+    return np.stack(columns, axis=1).reshape(count, *values.shape[1:])
+
+
+def interpolate_turns(known: Rotation, seen: np.ndarray, count: int) -> Rotation:
+    """Fill S rotations of frames `seen`, ascending, to F: the shortest way (slerp), ends held."""
+    from scipy.spatial.transform import Slerp
+
+    if len(seen) == 1:
+        return known[np.zeros(count, int)]
+    return Slerp(seen, known)(np.arange(count).clip(seen[0], seen[-1]))
+
+
 def filled(hand: HandParameters) -> HandParameters:
     """Interpolate the parameters of frames that are not valid, so that the hand can be drawn there.
 
-    Joints turn the shortest way between the valid frames around (slerp), and the place goes
-    straight; before the first valid frame and after the last they stand still. Valid frames, and
-    which these are, stay as they are.
+    Valid frames, and which these are, stay as they are.
     """
-    from scipy.spatial.transform import Rotation, Slerp
+    from scipy.spatial.transform import Rotation
 
-    seen = np.flatnonzero(hand.valid)
-    if len(seen) in (0, hand.frame_count):
+    seen, count = np.flatnonzero(hand.valid), hand.frame_count
+    if len(seen) in (0, count):
         return hand
-    frames = np.arange(hand.frame_count).clip(seen[0], seen[-1])
     pose, transl = hand.pose.copy(), hand.transl.copy()
     lost = ~hand.valid
-    # The last one twice, since an interpolation needs two.
-    known = np.append(seen, seen[-1])
-    times = np.append(seen, seen[-1] + 1)
     for joint in range(pose.shape[1]):
-        turns = Slerp(times, Rotation.from_rotvec(hand.pose[known, joint]))
-        pose[lost, joint] = turns(frames[lost]).as_rotvec()
-    for axis in range(3):
-        transl[lost, axis] = np.interp(frames[lost], seen, hand.transl[seen, axis])
+        known = Rotation.from_rotvec(hand.pose[seen, joint])
+        pose[lost, joint] = interpolate_turns(known, seen, count)[lost].as_rotvec()
+    transl[lost] = interpolate(hand.transl[seen], seen, count)[lost]
     return replace(hand, pose=pose, transl=transl)
 
 

@@ -11,6 +11,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from hwp_bench.hands.poses import interpolate
 from hwp_bench.importers.shared.landmarks import Landmarks
 
 #: Room around the outermost landmark, as a share of the window's half side; finger tips reach
@@ -73,14 +74,13 @@ def follow_hands(hands: Sequence[Landmarks], fps: float, size: int) -> CropWindo
     """
     from scipy.ndimage import gaussian_filter1d
 
-    frames = np.arange(len(hands[0].score))
     detected = np.any([hand.detected for hand in hands], axis=0)
     seen = np.flatnonzero(detected)
     boxes = [_boxes(hand, seen) for hand in hands]
     low = np.min([box[0] for box in boxes], axis=0)
     high = np.max([box[1] for box in boxes], axis=0)
     middle = (low + high) / 2.0
-    path = np.stack([np.interp(frames, seen, middle[:, axis]) for axis in (0, 1)], axis=1)
+    path = interpolate(middle, seen, len(detected))
     path = gaussian_filter1d(path, sigma=CENTRE_SECONDS * fps, axis=0, mode="nearest")
     reach = np.maximum(high - path[seen], path[seen] - low).max()
     side = max(int(np.ceil(2.0 * reach * (1.0 + MARGIN))), 2)
@@ -92,7 +92,7 @@ def _boxes(hand: Landmarks, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     own = np.flatnonzero(hand.detected)
     points = hand.image[own]
     low, high = (
-        np.stack([np.interp(frames, own, corner[:, axis]) for axis in (0, 1)], axis=1)
+        interpolate(corner, own, len(hand.score))[frames]
         for corner in (points.min(axis=1), points.max(axis=1))
     )
     return low, high

@@ -11,6 +11,7 @@ import torch
 from hwp_bench.base.kernels import compiled
 from hwp_bench.hands import HandParameters, HandTemplate, pose_hand
 from hwp_bench.hands.articulation import axis_angle_to_matrix, right_jacobian
+from hwp_bench.hands.poses import interpolate, interpolate_turns
 from hwp_bench.hands.skeleton import moved_joints
 from hwp_bench.hands.skinning import only_fingertips
 from hwp_bench.importers.shared.landmarks import PALM, Landmarks
@@ -215,7 +216,7 @@ def rigid_start(
     the least-squares solution of the pinhole equations, which are linear in it. Frames without
     a detection are interpolated. `rest` (21, 3) m are the template's landmarks.
     """
-    from scipy.spatial.transform import Rotation, Slerp
+    from scipy.spatial.transform import Rotation
 
     count, seen = landmarks.score.size, np.flatnonzero(landmarks.detected)
     pixels = landmarks.image[seen]
@@ -224,20 +225,11 @@ def rigid_start(
     palm = list(PALM)
     rotation = _procrustes(rest[palm], world[:, palm])
     wrist = _place(world - world[:, :1], (pixels - centre) / focal)
-    known, frames = Rotation.from_matrix(rotation), np.clip(np.arange(count), seen[0], seen[-1])
-    turns = Slerp(seen, known)(frames) if len(seen) > 1 else known[np.zeros(count, int)]
     return RigidStart(
-        rotation=turns.as_matrix(),
+        rotation=interpolate_turns(Rotation.from_matrix(rotation), seen, count).as_matrix(),
         wrist=interpolate(wrist, seen, count),
         world=interpolate(world, seen, count),
     )
-
-
-def interpolate(values: np.ndarray, seen: np.ndarray, count: int) -> np.ndarray:
-    """Fill values (S, ...) of frames `seen`, ascending, to (F, ...): linearly, ends held."""
-    flat = values.reshape(len(seen), -1)
-    columns = [np.interp(np.arange(count), seen, column) for column in flat.T]
-    return np.stack(columns, axis=1).reshape(count, *values.shape[1:])
 
 
 def _ray_rotation(pixels: np.ndarray, focal: float, centre: np.ndarray) -> np.ndarray:

@@ -22,12 +22,12 @@ from synthetic_clip import (
 
 from hwp_bench.base.errors import DidNotConverge
 from hwp_bench.hands import pose_hand
+from hwp_bench.hands.poses import interpolate
 from hwp_bench.hands.skinning import pose_parameters
 from hwp_bench.importers.shared.frames import cut, follow_hands
 from hwp_bench.importers.shared.landmarks import Landmarks, read_landmarks
 from hwp_bench.importers.video.gradients import ClipEnergy
 from hwp_bench.importers.video.model import (
-    interpolate,
     pose_vertices,
     rigid_start,
     unwrap_rotations,
