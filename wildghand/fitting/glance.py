@@ -68,7 +68,7 @@ def glance(fit: Fit, row: int, step: int, loss: float, angle: float = 0.0) -> Gl
     drawn = fit.draw(batch, kept=without).image[0] / fit.model.log_gains[row].exp()
     frame = int(fit.data.frames.indices[row])
     truth = training.frame(frame)
-    image = drawn.clamp(0.0, 1.0).nan_to_num(0.0).float().cpu().numpy()
+    image = _pixels(drawn)
     weights = target.weights[0].float()
     share = weights / weights.max().clamp(min=1e-12)
     return Glance(
@@ -94,17 +94,18 @@ def _turned(fit: Fit, row: int, angle: float) -> np.ndarray:
     about[0, 0], about[0, 2], about[2, 0], about[2, 2] = cos, sin, -sin, cos
     about[:3, 3] = seen - about[:3, :3] @ seen
     image, _ = fit.model.draw(
-        {
-            side: (pose[rows], betas, transl[rows])
-            for side, (pose, betas, transl) in clip.parameters.items()
-        },
+        clip.given(rows),
         (about @ viewmat).float()[None],
         clip.Ks[rows],
         training.width,
         training.height,
         refine=fit.settings.heads,
     )
-    return as_uint8(image[0].clamp(0.0, 1.0).nan_to_num(0.0).float().cpu().numpy())
+    return as_uint8(_pixels(image[0]))
+
+
+def _pixels(image: torch.Tensor) -> np.ndarray:
+    return image.clamp(0.0, 1.0).nan_to_num(0.0).float().cpu().numpy()
 
 
 def _psnr(image: np.ndarray, truth: np.ndarray, hand: np.ndarray) -> float:

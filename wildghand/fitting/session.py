@@ -131,7 +131,7 @@ def fit_capture(
     if out is not None and kept and not (Path(out) / CALL).is_file():
         raise exists
     capture = open_capture(source)
-    split = every_frame(capture, tested_frames(capture)) if all_frames else _split(capture)
+    split = every_frame(capture, tested=True) if all_frames else _split(capture)
     if out is None:
         with tempfile.TemporaryDirectory() as folder:
             avatar = _fit_in(Path(folder), capture, split, run, world, watch, save=False)
@@ -330,13 +330,12 @@ def _split(capture: Capture) -> Split:
 _TESTED_SHARE, _MOST_TESTED = 20, 12
 
 
-def tested_frames(capture: Capture) -> int:
-    """Return how many of a clip's last frames a fit of all frames leaves out, to be tested."""
-    return max(1, min(_MOST_TESTED, capture.info.frame_count // _TESTED_SHARE))
+def every_frame(capture: Capture, *, tested: bool = False) -> Split:
+    """Every frame but the last two, which stand for the parts that a split must have.
 
-
-def every_frame(capture: Capture, tested: int = 1) -> Split:
-    """Every frame but the last: one stands for validation, and some are there to test the fit."""
+    Args:
+        tested: leave out more, to test the fit with them.
+    """
     count = capture.info.frame_count
     if count < 3:
         raise BadInput(
@@ -344,5 +343,6 @@ def every_frame(capture: Capture, tested: int = 1) -> Split:
             where=capture.root,
             field="frame_count",
         )
-    first = count - tested
+    most = _MOST_TESTED if tested else 1
+    first = count - max(1, min(most, count // _TESTED_SHARE))
     return Split(capture.info.id, count, (0, first - 1), (first - 1, first), (first, count))

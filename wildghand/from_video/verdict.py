@@ -25,7 +25,7 @@ from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.hands.skeleton import palm_directions
 from hwp_bench.metrics.score import score_frame
 from wildghand.avatar.avatar import WildGHandAvatar
-from wildghand.fitting.session import every_frame, tested_frames
+from wildghand.fitting.session import every_frame
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import HandRig
 from wildghand.gaussians.training import TrainingClip
@@ -152,8 +152,11 @@ def parts_of(rig: HandRig, side: str) -> dict[str, np.ndarray]:
 def _score(avatar: WildGHandAvatar, capture: Capture) -> tuple[float | None, int, Any]:
     """PSNR over frames at the end that the fit has not seen, else over fitted ones."""
     frames, kept_out = np.array(avatar.record.frames), False
-    whole = every_frame(capture, tested_frames(capture))
-    for split in (whole, contiguous_split(capture.info.id, len(capture))):
+    whole, parted = (
+        every_frame(capture, tested=True),
+        contiguous_split(capture.info.id, len(capture)),
+    )
+    for split in (whole, parted):
         valid = [capture.hands[side].valid[split.test] for side in avatar.sides]
         test = split.test[np.all(valid, axis=0)]
         if len(test) >= _LEAST_SCORED and not np.isin(test, avatar.record.frames).any():

@@ -244,6 +244,15 @@ class TrainingClip:
             rows = torch.arange(len(indices), device=device)
             self._cache = {side: self._pose(side, rows) for side in rigs}
 
+    def given(
+        self, rows: torch.Tensor
+    ) -> dict[str, tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
+        """The parameters of the hands in (B,) rows, by side: pose, betas and transl."""
+        return {
+            side: (pose[rows], betas, transl[rows])
+            for side, (pose, betas, transl) in self.parameters.items()
+        }
+
     def hand(self, side: str, rows: torch.Tensor) -> AnchorPoses:
         """The anchors of one hand in (B,) rows, without gradient; they must not be changed."""
         if self._cache is None:

@@ -196,11 +196,7 @@ class WildGHandModel(nn.Module):
             dark: (B, N) factors of the hands' shadows by side, where they are at hand already.
         """
         if dark is None:
-            hands = {
-                side: (pose[rows], betas, transl[rows])
-                for side, (pose, betas, transl) in clip.parameters.items()
-            }
-            dark = self.cast(hands)
+            dark = self.cast(clip.given(rows))
         temporal = {side: self.biases_of(side).temporal(rows) for side in self.perturbation}
         shares = None
         if teach is not None:
