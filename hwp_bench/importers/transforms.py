@@ -24,7 +24,15 @@ from msgspec import Meta
 
 from hwp_bench.base.arrays import read_npz, write_npz
 from hwp_bench.base.errors import BadInput, of_type, place
-from hwp_bench.base.files import atomic_folder, inside, read_json, refuse_existing, write_json
+from hwp_bench.base.files import (
+    atomic_folder,
+    check_places,
+    inside,
+    read_json,
+    refuse_existing,
+    refuse_other,
+    write_json,
+)
 from hwp_bench.base.images import read_gray, read_rgb, write_image
 from hwp_bench.base.records import Line, parse_record
 from hwp_bench.capture import Cameras, Capture, CaptureInfo, CaptureWriter, schema
@@ -84,11 +92,15 @@ def export_transforms(
     lists the split by the 80/10/10 rule. Truth and free-view clip are left out.
 
     Raises:
-        UsageError: `out` exists.
+        UsageError: `out` exists without `overwrite`, is something else than an exported scene, lies
+            in a capture or holds this one.
         BadInput: a camera has skew, which `transforms.json` cannot express.
     """
     of_type(capture, Capture, "capture", "an opened capture")
     out, info, cameras = place(out, "out"), capture.info, capture.cameras
+    check_places({"out": out}, {"capture": capture.root}, replaces=overwrite)
+    refuse_other(out, "an exported scene", lambda folder: (folder / TRANSFORMS).is_file())
+    refuse_existing(out, overwrite=overwrite)
     if cameras.Ks[:, 0, 1].any():
         raise BadInput("has skew, for which transforms.json has no field", where=capture.root)
     poses = _UPRIGHT @ np.linalg.inv(cameras.viewmats) @ _FLIP

@@ -12,7 +12,7 @@ import pytest
 from small_captures import CaptureMaker, free_hand, hand_parameters, hand_picture
 
 import hwp_bench
-from hwp_bench.base.errors import BadInput, HwpError
+from hwp_bench.base.errors import BadInput, HwpError, UsageError
 from hwp_bench.capture import Cameras, CaptureInfo, CaptureWriter, open_capture
 
 #: Degrees that the camera of a frame is turned about the vertical.
@@ -97,6 +97,17 @@ def scene(turning: Path, tmp_path: Path) -> Callable[..., Path]:
         return file.parent
 
     return make
+
+
+def test_an_export_replaces_nothing_but_an_export(turning: Path, tmp_path: Path) -> None:
+    capture, mine = open_capture(turning), tmp_path / "mine"
+    mine.mkdir()
+    (mine / "notes.txt").write_text("a year")
+    for place in (turning, turning / "scene", mine, tmp_path):
+        with pytest.raises(UsageError):
+            hwp_bench.export_transforms(capture, place, overwrite=True)
+    assert open_capture(turning).digest == capture.digest
+    assert (mine / "notes.txt").read_text() == "a year"
 
 
 def test_a_file_of_another_program_is_read(scene: Callable[..., Path], tmp_path: Path) -> None:
