@@ -136,9 +136,6 @@ def hand_meshes(capture: Capture, frame: int, *, truth: bool = False) -> dict[st
     """Return the posed meshes of the hands that one frame shows, by side, in the world, m."""
     capture.hand_poses(frame)  # Refuses a frame that is not there.
     hands = capture.hands
-    sides = [side for side, hand in hands.items() if hand.valid[frame]]
-    if not sides:
-        raise UsageError(f"shows no hand in frame {frame}", where=capture.root, field="--frame")
     if truth:
         known = capture.true_hands
         if known is None:
@@ -147,7 +144,10 @@ def hand_meshes(capture: Capture, frame: int, *, truth: bool = False) -> dict[st
                 where=capture.root,
                 remedy="Only simulated captures do; leave out --truth.",
             )
-        hands = known
+        hands = known  # It has the hand where the estimator failed, too.
+    sides = [side for side, hand in hands.items() if hand.valid[frame]]
+    if not sides:
+        raise UsageError(f"shows no hand in frame {frame}", where=capture.root, field="--frame")
     return {
         side: to_trimesh(
             pose_parameters(capture.template(side), hands[side], [frame]).vertices[0],

@@ -245,6 +245,13 @@ def test_truth_must_be_known(make_capture: CaptureMaker) -> None:
     np.testing.assert_allclose(true - given, 0.5, atol=1e-9)
 
 
+def test_the_truth_has_a_hand_where_the_estimator_failed(make_capture: CaptureMaker) -> None:
+    capture = make_capture(hands="both", frames=10, truth=True)
+    for side in ("left", "right"):
+        capture.hands[side].valid[4] = False
+        assert tuple(hand_meshes(capture, 4, truth=True)) == ("right", "left")
+
+
 def test_an_existing_output_is_refused_before_the_fit(
     make_capture: CaptureMaker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
