@@ -29,6 +29,7 @@ from hwp_bench.cli.options import (
 from hwp_bench.taxonomy import REAL_SUITES, SUITES
 
 if TYPE_CHECKING:
+    from hwp_bench.capture import Capture
     from hwp_bench.capture.check import CheckReport, Finding
     from hwp_bench.capture.splits import AuditReport, Split
 
@@ -55,6 +56,7 @@ def _add_check(parser: argparse.ArgumentParser) -> None:
 
 def _check(args: argparse.Namespace) -> int:
     from hwp_bench.capture.check import Finding, check_capture
+    from hwp_bench.capture.splits import audit_split
 
     if args.guard < 0 or (args.guard and args.splits):
         raise UsageError("a guard gap is at least 0, and not for a split file", field="--guard")
@@ -65,14 +67,15 @@ def _check(args: argparse.Namespace) -> int:
         # Frames that cannot be read cannot be compared.
         if report.ok:
             try:
-                audit = _audit(path, splits, args.guard)
+                capture, split = _capture_and_split(path, splits, args.guard)
+                audit, found = audit_split(capture, split), _unscorable(capture, split)
             except BadSplit as error:
-                found = Finding("error", path, error.field, error.problem, error.remedy)
-                report = replace(report, findings=(found, *report.findings))
+                found = [Finding("error", path, error.field, error.problem, error.remedy)]
+            report = replace(report, findings=(*found, *report.findings))
         sound = sound and report.ok and (audit is None or audit.ok)
         if args.json:
-            split = None if audit is None else {"ok": audit.ok, **asdict(audit)}
-            rows.append({"ok": report.ok, **asdict(report), "split": split})
+            fair = None if audit is None else {"ok": audit.ok, **asdict(audit)}
+            rows.append({"ok": report.ok, **asdict(report), "split": fair})
             continue
         _print_check(report)
         if audit is not None:
@@ -149,16 +152,34 @@ def _show(args: argparse.Namespace) -> int:
     return 0
 
 
-def _audit(path: str, splits: Mapping[str, Split] | None, guard: int) -> AuditReport:
+def _capture_and_split(
+    path: str, splits: Mapping[str, Split] | None, guard: int
+) -> tuple[Capture, Split]:
     from hwp_bench.capture import open_capture
-    from hwp_bench.capture.splits import audit_split, contiguous_split, split_for
+    from hwp_bench.capture.splits import contiguous_split, split_for
 
     capture = open_capture(path)
     if splits is None:
-        split = contiguous_split(capture.info.id, len(capture), guard=guard)
-    else:
-        split = split_for(capture.info.id, len(capture), splits)
-    return audit_split(capture, split)
+        return capture, contiguous_split(capture.info.id, len(capture), guard=guard)
+    return capture, split_for(capture.info.id, len(capture), splits)
+
+
+def _unscorable(capture: Capture, split: Split) -> list[Finding]:
+    """The frames that a test scores and whose mask leaves nothing to score."""
+    from hwp_bench.capture.check import Finding
+    from hwp_bench.metrics.pixels import can_be_scored
+
+    clip, found = capture.free_view, []
+    scored: list[tuple[Capture, Iterable[int], str]] = [(capture, split.test, "test")]
+    if clip is not None:
+        scored.append((clip, range(len(clip)), "free-view"))
+    for part, frames, name in scored:
+        for frame in frames:
+            if not can_be_scored(*part.scoring_mask(frame)):
+                problem = f"the mask of {name} frame {frame} leaves no pixel to score"
+                remedy = "These frames must show the hand."
+                found.append(Finding("error", str(part.root), "masks", problem, remedy))
+    return found
 
 
 def _print_audit(report: AuditReport) -> None:

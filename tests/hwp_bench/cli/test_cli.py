@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 from small_captures import CaptureMaker, split_file
 
+from hwp_bench.capture import CaptureWriter
 from hwp_bench.capture.folder import rewrite_capture
 from hwp_bench.cli.main import command_tree, main
 from hwp_bench.cli.program import Command
@@ -117,6 +118,19 @@ def test_a_capture_without_a_split_does_not_keep_others_from_being_checked(
     out = capsys.readouterr().out
     assert "short: fair" in out
     assert "long: is not in the split file. The file lists: short." in out
+
+
+def test_a_capture_that_no_evaluation_takes_is_not_sound(
+    make_capture: CaptureMaker, tmp_path: Path, capsys
+) -> None:
+    one = make_capture(frames=20)
+    with CaptureWriter(tmp_path / "thin", one.info, one.hands, one.cameras) as writer:
+        for frame in range(20):
+            writer.frame(frame, one.frame(frame))
+            writer.mask(frame, one.mask(frame) * (frame != 18))
+    assert main(["data", "check", str(tmp_path / "thin")]) == 1
+    out = " ".join(capsys.readouterr().out.split())
+    assert "the mask of test frame 18 leaves no pixel to score" in out
 
 
 def test_no_gap_is_recommended_that_a_split_cannot_have(
