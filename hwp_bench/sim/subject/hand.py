@@ -22,7 +22,7 @@ import numpy as np
 
 from hwp_bench.base.arrays import read_npz
 from hwp_bench.base.colors import srgb_to_linear
-from hwp_bench.base.errors import BadInput, HwpError
+from hwp_bench.base.errors import BadHandModel, BadInput, HwpError
 from hwp_bench.base.files import atomic_write, cache_root, sha256_json, sha256_of
 from hwp_bench.base.numerics import kd_tree
 from hwp_bench.hands.poses import FIRST_JOINT
@@ -536,6 +536,15 @@ def subject_hand(subject: Subject, side: str, subdivisions: int = FINE) -> Subje
     template, model, betas, joints, texture = person(subject, side)
     own_skin = None
     if texture is not None:
+        looks = of_side(subject, side).looks
+        for name in ("tattoos", "polish", "gloves"):
+            if getattr(looks, name):
+                raise BadHandModel(
+                    "cannot be painted on a rig that has a texture of its own",
+                    where=subject.model,
+                    field=f"subject.looks.{name}",
+                    remedy="Leave it out, or take the texture out of the rig.",
+                )
         own_skin = Material(albedo(texture), gloss=0.55, specular=_GLOSS, wrap=_WRAP)
     faces = template.faces
     corner_uv = template.uv[template.face_uv]

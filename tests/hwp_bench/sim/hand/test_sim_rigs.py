@@ -43,6 +43,8 @@ from hwp_bench.sim.hand.rigs import (
 from hwp_bench.sim.produce.capture import RENDERER, render_key
 from hwp_bench.sim.render.frame import render_frame
 from hwp_bench.sim.scene.scene import Scene
+from hwp_bench.sim.subject import hand
+from hwp_bench.sim.subject.subject import Glove, Looks, Subject
 
 #: The joints as OpenXR rigs name them, without the side's suffix.
 OPENXR = (
@@ -117,6 +119,19 @@ def test_a_scene_shows_the_rig(tmp_path: Path, make_scene: Callable[..., Scene])
     either = (result.coverage > 0.5) | (own.coverage > 0.5)
     # The subject's shape is not the rig's, but the pose is.
     assert both.sum() / either.sum() > 0.7
+
+
+def test_gloves_on_a_rig_with_a_texture_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig, white = hand.load_rig, np.full((4, 4, 3), 255, np.uint8)
+    monkeypatch.setattr(hand, "load_rig", lambda *given: (rig(*given)[0], white))
+    hand.subject_hand.cache_clear()
+    looks = Looks(gloves=(Glove("work"),))
+    worn = Subject(seed=1, tone=0.3, age=30.0, model="rig:generic-hand", looks=looks)
+    try:
+        with pytest.raises(BadHandModel, match=r"subject\.looks\.gloves"):
+            hand.subject_hand(worn, "right")
+    finally:
+        hand.subject_hand.cache_clear()
 
 
 def test_another_rig_in_the_same_place_is_another_render(
