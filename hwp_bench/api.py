@@ -18,6 +18,7 @@ from hwp_bench.analysis.compare import Comparison, compare_results
 from hwp_bench.base.console import JobsView, notice
 from hwp_bench.base.errors import UsageError, of_type, place, whole_number
 from hwp_bench.base.folders import scratch_folder
+from hwp_bench.base.records import whole_seed
 from hwp_bench.capture import Capture
 from hwp_bench.evaluation.capture_evaluation import EvaluationSettings
 from hwp_bench.evaluation.evaluate import (
@@ -208,9 +209,7 @@ def compare(
     )
     for name in names:
         of_type(name, str, "metrics", "names")
-    resamples, seed = whole_number(resamples, "resamples"), whole_number(seed, "seed")
-    if seed < 0:
-        raise UsageError(f"is {seed}", field="seed", remedy="Use 0 or more.")
+    resamples, seed = whole_number(resamples, "resamples"), whole_seed(seed, "seed")
     read: list[Results] = []
     for result in results:
         read += [result] if isinstance(result, Results) else read_all([place(result, "results")])

@@ -51,10 +51,12 @@ from hwp_bench.base.errors import (
     BadInput,
     BadResult,
     HwpError,
+    UsageError,
     has_odd_characters,
     is_unicode,
     nearest,
     shown,
+    whole_number,
 )
 from hwp_bench.base.files import MAX_JSON_INTEGER, inner_values
 
@@ -318,6 +320,14 @@ Count = Annotated[int, Meta(ge=0, le=MAX_COUNT)]
 Digest = Annotated[str, Meta(pattern=r"\A[0-9a-f]{64}\Z", description="64 hexadecimal digits")]
 #: A seed of random numbers.
 Seed = Annotated[int, Meta(ge=0, le=MAX_SEED)]
+
+
+def whole_seed(value: Any, field: str) -> int:
+    """Return a seed that every file and every generator can hold as Python's integer."""
+    seed = whole_number(value, field)
+    if not 0 <= seed <= MAX_SEED:
+        raise UsageError(f"{brief(seed)} is not from 0 to {MAX_SEED}", field=field)
+    return seed
 
 
 def number(default: Any, low: float = 0.0, high: float = math.inf) -> Any:

@@ -75,8 +75,8 @@ def _add_preview(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("scene", metavar="SCENE", help="scene name or file")
     add("-o", "--out", default=".", help="folder (default: here)")
-    add("--frame-count", type=int, default=48, metavar="N", help="frames (default 48)")
-    add("--size", type=int, default=160, help="edge in pixels (default 160)")
+    add("--frame-count", type=int, metavar="N", help="frames (default 48)")
+    add("--size", type=int, help="edge in pixels (default 160)")
     _add_variation(parser)
     text = "draw hand, objects, light and camera in 3D instead"
     add("--stage", action="store_true", help=text)
@@ -170,8 +170,6 @@ def _render(args: argparse.Namespace) -> int:
         return 0
     if args.out is None:
         raise UsageError("is missing", field="-o", remedy="Give a folder with -o.")
-    if args.seed is not None and args.seed < 0:
-        raise UsageError(f"is {args.seed}", field="--seed", remedy="Use 0 or more.")
     scenes = [
         _changed(scene, args.clean_share, args.severity, args.subject)
         for scene in _scenes([args.scene])
@@ -211,6 +209,10 @@ def _preview(args: argparse.Namespace) -> int:
     check_places({"--out": args.out}, {})
     from hwp_bench.sim.scene_files import load_scene
 
+    given = {"frame_count": args.frame_count, "size": args.size}
+    given = {name: value for name, value in given.items() if value is not None}
+    if args.stage and given:
+        raise UsageError("are of the sheet, not of --stage", field="--frame-count, --size")
     scene = _changed(load_scene(args.scene), args.clean_share, args.severity, args.subject)
     if args.stage:
         from hwp_bench.sim.produce.preview import draw_stage
@@ -219,7 +221,7 @@ def _preview(args: argparse.Namespace) -> int:
         return 0
     from hwp_bench.sim.produce.preview import write_preview
 
-    for path in write_preview(scene, Path(args.out), frame_count=args.frame_count, size=args.size):
+    for path in write_preview(scene, Path(args.out), **given):
         print(path)
     return 0
 
@@ -235,11 +237,15 @@ def _calibrate(args: argparse.Namespace) -> int:
         calls = [call for call in scene.effects if args.effect in (None, call.kind)]
         results = [calibrate(scene, call) for call in calls]
         if args.write:
-            write_strengths(scene_path(name) if name in known_scenes() else Path(name), results)
-        digest = load_scene(name).digest if args.write else scene.digest
+            path = scene_path(name) if name in known_scenes() else Path(name)
+            write_strengths(path, results)
+            # By its path, since a scene that ships is read once.
+            scene = load_scene(str(path))
         for item in results:
             row = asdict(item)
-            rows.append({"scene": scene.id, "digest": digest, "effect": row.pop("kind"), **row})
+            rows.append(
+                {"scene": scene.id, "digest": scene.digest, "effect": row.pop("kind"), **row}
+            )
             if not args.json:
                 measured = " ".join(f"{value:7.3f}" for value in item.measured)
                 target = " ".join(f"{value:7.3f}" for value in item.targets)

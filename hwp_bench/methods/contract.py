@@ -15,7 +15,7 @@ from msgspec import Meta
 from hwp_bench.base.arrays import evenly
 from hwp_bench.base.errors import BadInput, UsageError, of_type, real_number, whole_number
 from hwp_bench.base.images import read_gray, read_rgb
-from hwp_bench.base.records import MAX_COUNT, MAX_SECONDS, MAX_SEED, Line, Seed, brief
+from hwp_bench.base.records import MAX_COUNT, MAX_SECONDS, Line, Seed, brief, whole_seed
 from hwp_bench.capture.schema import (
     CAMERAS,
     FREE_VIEW,
@@ -157,10 +157,7 @@ class RunSettings:
     def __post_init__(self) -> None:
         of_type(self.settings, Mapping, "settings", "a table of settings by name")
         of_type(self.frames, str, "frames", "a text")
-        object.__setattr__(self, "seed", whole_number(self.seed, "seed"))
-        # Every file that keeps a seed, and every generator that takes one, can hold these.
-        if not 0 <= self.seed <= MAX_SEED:
-            raise UsageError(f"{brief(self.seed)} is not from 0 to {MAX_SEED}", field="seed")
+        object.__setattr__(self, "seed", whole_seed(self.seed, "seed"))
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from msgspec import Meta
 
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.records import MAX_CHARACTERS, parse_record, parse_toml
+from hwp_bench.capture.schema import check_id
 from hwp_bench.sim.effects import check_hands, check_modes, read_effect
 from hwp_bench.sim.props.behind import check_backdrop
 from hwp_bench.sim.scene.scene import (
@@ -113,6 +114,7 @@ def parse_scene(text: str, *, where: str) -> Scene:
     effects = parse_record(_Effects, rows, where=where, error=BadInput)
     noise = {name: content.pop(name) for name in ("noise",) if name in content}
     scene = parse_record(Scene, content, where=where, error=BadInput)
+    check_id(scene.id, where)  # It names the capture, and files of previews.
     calls = tuple(_effect(row, f"effects[{i}]", where) for i, row in enumerate(effects.effects))
     scene = replace(scene, effects=calls)
     if "sensor" not in content:

@@ -26,6 +26,7 @@ from hwp_bench.base.console import progress
 from hwp_bench.base.errors import HwpError, UsageError, place, reason_of, whole_number
 from hwp_bench.base.files import atomic_write, cache_root, canonical_json, sha256_json
 from hwp_bench.base.folders import exclusive
+from hwp_bench.base.records import whole_seed
 from hwp_bench.capture import (
     Cameras,
     Capture,
@@ -35,7 +36,7 @@ from hwp_bench.capture import (
     open_capture,
 )
 from hwp_bench.capture.folder import refuse_taken
-from hwp_bench.capture.schema import FREE_VIEW, SIMULATED
+from hwp_bench.capture.schema import FREE_VIEW, SIMULATED, check_id
 from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.hands.sources import absolute_source
 from hwp_bench.run.engine import Engine, Job, LocalEngine, Needs
@@ -135,10 +136,9 @@ class RenderRequest:
     def checked(self) -> RenderRequest:
         """The request with its seed in the scene; refuses what cannot be rendered."""
         scene = self.scene
+        check_id(scene.id, "scene")
         if self.seed is not None:
-            if whole_number(self.seed, "seed") < 0:
-                raise UsageError(f"is {self.seed}", field="seed", remedy="Use 0 or more.")
-            scene = replace(scene, seed=self.seed)
+            scene = replace(scene, seed=whole_seed(self.seed, "seed"))
         check_extent(self.frames, self.edge, self.workers)
         if scene.sensor.h264:
             check_encoder(scene.id)

@@ -16,7 +16,7 @@ from msgspec import Meta
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import sha256_json
-from hwp_bench.base.records import Seed, number
+from hwp_bench.base.records import Seed, number, whole_seed
 from hwp_bench.hands.poses import finger_pose, gesture, mirrored, within_limits
 from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.sim.geometry.noise import generator
@@ -254,9 +254,7 @@ def with_severity(scene: Scene, severity: float) -> Scene:
 
 def with_subject(scene: Scene, seed: int) -> Scene:
     """The scene with another person: shape, tone, age and sleeve follow from the seed."""
-    if seed < 0:
-        raise UsageError(f"{seed} is not a seed", field="subject")
-    rng = generator(seed, "person")
+    rng = generator(whole_seed(seed, "subject"), "person")
     red, green, blue = (round(float(channel), 3) for channel in rng.uniform(0.12, 0.8, 3))
     person = Subject(
         seed=seed,

@@ -13,6 +13,7 @@ from tiny_scene import SINGLE, SceneMaker
 from hwp_bench.base.errors import UsageError
 from hwp_bench.cli.main import main
 from hwp_bench.cli.sim import _changed
+from hwp_bench.sim import scene_files
 from hwp_bench.sim.produce.calibration import TARGETS, Calibration, calibrate, write_strengths
 from hwp_bench.sim.scene.scene import clean_share
 from hwp_bench.sim.scene_files import known_scenes, load_scene, scene_groups, scene_names
@@ -83,6 +84,10 @@ def test_render_and_preview(
         ["dev", "calibrate", "wild-dev-7", "--effect", "blur"],
         ["sim", "render", "capture0", "-o", "x", "--severity", "9"],
         ["sim", "preview", "capture0", "--frame-count", "1"],
+        ["sim", "preview", "capture0", "--stage", "--size", "64"],
+        ["sim", "render", "capture0", "-o", "x", "--seed", "-1"],
+        ["sim", "render", "capture0", "-o", "x", "--seed", str(2**63)],
+        ["sim", "render", "capture0", "-o", "x", "--subject", str(2**63)],
         # Numbers that no memory holds.
         *(
             [*words, f"{option}={value}"]
@@ -119,6 +124,23 @@ def test_calibration_finds_the_stated_loss(make_scene: SceneMaker) -> None:
     result = calibrate(scene, call, size=40)
     assert list(result.strengths) == sorted(result.strengths)
     np.testing.assert_allclose(result.measured, TARGETS["illumination"], atol=0.7)
+
+
+def test_the_digest_is_that_of_the_written_strengths(
+    scene_file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(scene_files, "known_scenes", lambda: ("tiny",))
+    monkeypatch.setattr(scene_files, "scene_path", lambda name: scene_file)
+    found = Calibration("illumination", "psnr", (0.1, 0.2, 0.3, 0.4, 0.5), (1.0,) * 5, (1.0,) * 5)
+    monkeypatch.setattr("hwp_bench.sim.produce.calibration.calibrate", lambda *_: found)
+    scene_files._shipped_scene.cache_clear()
+    try:
+        words = ["dev", "calibrate", "tiny", "--effect", "illumination", "--write", "--json"]
+        assert main(words) == 0
+    finally:
+        scene_files._shipped_scene.cache_clear()
+    (row,) = json.loads(capsys.readouterr().out)
+    assert row["digest"] == load_scene(scene_file).digest
 
 
 def test_strengths_are_written_into_the_file(scene_file: Path) -> None:

@@ -166,6 +166,8 @@ def test_nothing_acts_in_validation_and_test(name: str) -> None:
     ("old", "new", "field"),
     [
         ('title = "A small scene"\n', "", "title"),
+        ('id = "tiny"', 'id = "my hand"', "id"),
+        ('id = "tiny"', 'id = "../tiny"', "id"),
         ("seed = 5", "seed = -5", "seed"),
         ("fps = 20.0", "fps = nan", "fps"),
         ("tone = 0.22", "tone = 1.5", "subject.tone"),
