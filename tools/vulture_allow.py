@@ -38,7 +38,7 @@ _.shadow_rate  # `Recipe.rates` reads it by the tensor's name
 _.texture_rate  # `Recipe.rates` reads it by the tensor's name
 _.transl_rate  # `Recipe.rates` reads it by the tensor's name
 WildGHandMethod  # the entry of wildghand/method.toml and of baselines/network-scratch
-check_networks  # `check_files` of wildghand/method.toml and of baselines/network-scratch
+check_files  # `check_files` of wildghand/method.toml and of baselines/network-scratch
 modified  # part of the cache's key: a changed file is read again
 _.maxlong  # reprlib reads it
 _.maxother  # reprlib reads it

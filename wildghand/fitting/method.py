@@ -17,6 +17,7 @@ from hwp_bench.methods.settings import source_path
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.dpd.dpd import DynamicPerturbation, FramePerturbation
 from wildghand.fitting.components import make_fit
+from wildghand.fitting.objective import refuse_idle_network
 from wildghand.gaussians.attributes import CHANNELS, Activation, RawAttributes
 from wildghand.gaussians.fit_loop import ready_device
 from wildghand.gaussians.perceptual import Vgg19
@@ -44,11 +45,13 @@ class WildGHandMethod:
 
     Raises:
         BadMethod: a setting is unknown or out of range.
+        UsageError: a perceptual network is named whose term has no weight.
         MissingDependency: CUDA was asked for and is not there.
     """
 
     def __init__(self, settings: Mapping[str, Any], seed: int = 0) -> None:
         self.settings = read_settings(settings)
+        refuse_idle_network(self.settings)
         self.seed = seed
         self.device = ready_fit(self.settings.device)
 
@@ -94,9 +97,11 @@ def digest_of_named_files(settings: WildGHandSettings) -> str:
     return exposed_digest(paths)
 
 
-def check_networks(values: Mapping[str, Any]) -> None:
-    """Check the files that settings name: that they are there and hold the right tensors."""
+def check_files(values: Mapping[str, Any]) -> None:
+    """Check the files that settings name: a prior's place, and networks with their tensors."""
     settings = read_settings(values)
+    if settings.prior not in ("", SHIPPED):
+        find_prior(settings.prior)
     for path in {source_path(settings.pao.regions), source_path(settings.pao.hand)} - {None}:
         check_checkpoint(str(path))
     perceptual = source_path(settings.perceptual)

@@ -109,15 +109,19 @@ class Regularisers(Component):
         return torch.stack(found).sum() if found else None
 
 
+def refuse_idle_network(settings: WildGHandSettings) -> None:
+    """Refuse a perceptual network whose term has no weight."""
+    if source_path(settings.perceptual) is not None and not settings.terms.perceptual:
+        raise UsageError(
+            "has no effect, since terms.perceptual is 0",
+            field="perceptual",
+            remedy="Set terms.perceptual too: 0.001 (mode default), 0.1 (mode paper).",
+        )
+
+
 def choose_perceptual(settings: WildGHandSettings, device: torch.device) -> nn.Module | None:
     """The perceptual distance of a fit; None where its weight is 0."""
-    path = source_path(settings.perceptual)
     if not settings.terms.perceptual:
-        if path is not None:
-            raise UsageError(
-                "has no effect, since terms.perceptual is 0",
-                field="perceptual",
-                remedy="Set terms.perceptual too: 0.001 (mode default), 0.1 (mode paper).",
-            )
         return None
+    path = source_path(settings.perceptual)
     return FilterBankLoss() if path is None else Vgg19(path).to(device)

@@ -37,6 +37,7 @@ from wildghand.avatar.files import (
 from wildghand.fitting.components import make_fit
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.method import affordable, digest_of_named_files, ready_fit
+from wildghand.fitting.objective import refuse_idle_network
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
 from wildghand.gaussians.fit_loop import Loss
 from wildghand.model.settings import WildGHandSettings, read_settings
@@ -120,6 +121,7 @@ def fit_capture(
         out: the avatar folder; None: nothing is written (`save_avatar` can do it later).
     """
     chosen = read_settings(settings or {})
+    refuse_idle_network(chosen)
     world.shard(chosen.schedule.batch)
     run = RunSettings(dict(settings or {}), seed, budget or Budget())
     if out is None and world.size > 1:

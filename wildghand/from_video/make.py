@@ -24,6 +24,8 @@ from hwp_bench.methods.contract import Budget
 from hwp_bench.tracking.networks import LiteRtNetworks, load_models
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import DESCRIPTION, load_avatar
+from wildghand.fitting.method import check_files
+from wildghand.fitting.objective import refuse_idle_network
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
 from wildghand.fitting.session import Watch, fit_capture
 from wildghand.fitting.tensorboard import logging_fit
@@ -134,6 +136,8 @@ def make_avatar(
     folder = default_folder(Path(video)) if out is None else Path(out)
     job = VideoJob(Path(video), folder, options, world, watch, glimpse)
     chosen = read_settings(options.method_settings())
+    refuse_idle_network(chosen)
+    check_files(options.method_settings())
     world.shard(chosen.schedule.batch)
     if world.is_main:
         _check_folder(job, overwrite=overwrite)

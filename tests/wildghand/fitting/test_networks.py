@@ -31,7 +31,7 @@ from wildghand.fitting import fit_capture
 from wildghand.fitting.components import make_fit
 from wildghand.fitting.fit import StepBatch
 from wildghand.fitting.judging import hand_masks, hand_roots
-from wildghand.fitting.method import check_networks, digest_of_named_files
+from wildghand.fitting.method import WildGHandMethod, check_files, digest_of_named_files
 from wildghand.fitting.session import digest_of_request
 from wildghand.from_video import VideoFit
 from wildghand.from_video.run import VideoJob
@@ -218,6 +218,7 @@ def test_an_ablation_takes_the_networks_too(
 @pytest.mark.parametrize(
     ("settings", "problem"),
     [
+        ({"prior": "/none"}, "is not a prior"),
         ({"pao.regions": "sam:/none/sam.pth"}, "does not exist"),
         ({"pao.hand": "sam:VGG"}, "not a checkpoint of Segment Anything"),
         ({"perceptual": "vgg19:SAM"}, "torchvision's VGG-19"),
@@ -236,7 +237,7 @@ def test_what_cannot_work_is_refused_before_a_suite_is_rendered(
     for word, place in places.items():
         settings = {name: value.replace(word, str(place)) for name, value in settings.items()}
     with pytest.raises((BadInput, UsageError), match=problem):
-        check_networks(settings)
+        check_files(settings)
     if "PATH" not in problem:
         out = tmp_path / "runs"
         for command in ("evaluate", "ablate"):
@@ -246,11 +247,14 @@ def test_what_cannot_work_is_refused_before_a_suite_is_rendered(
         assert not out.exists()
 
 
-def test_a_network_for_a_term_of_weight_0_is_refused(
-    folder: Path, make_training: TrainingMaker
+def test_a_network_for_a_term_of_weight_0_is_refused_before_anything_is_read(
+    folder: Path, tmp_path: Path
 ) -> None:
+    settings = {"device": "cpu", "perceptual": f"vgg19:{folder / 'vgg19.pth'}"}
     with pytest.raises(UsageError, match=r"terms\.perceptual is 0"):
-        weights(make_training(), perceptual=f"vgg19:{folder / 'vgg19.pth'}")
+        WildGHandMethod(settings)
+    with pytest.raises(UsageError, match=r"terms\.perceptual is 0"):
+        fit_capture(tmp_path / "none", tmp_path / "avatar", settings=settings)
 
 
 @pytest.mark.parametrize(
