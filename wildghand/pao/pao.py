@@ -46,6 +46,9 @@ def running_median(
 
 def _on_device(previous: float | Tensor | None, errors: Tensor, counted: Tensor) -> Tensor:
     """As above, without a shape that follows from the values."""
+    if not errors.numel():  # No region in these frames.
+        kept = LEAST if previous is None else previous
+        return torch.as_tensor(kept, dtype=torch.float64, device=errors.device)
     ordered = torch.where(counted, errors, math.inf).flatten().sort().values
     middle = (counted.sum() - 1).clamp(min=0) // 2
     found = ordered.gather(0, middle[None])[0].double()

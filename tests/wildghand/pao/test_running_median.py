@@ -54,3 +54,8 @@ def test_the_same_where_nobody_waits() -> None:
         found = _on_device(previous, errors, counted & errors.isfinite())
         assert float(found) == pytest.approx(float(expected), rel=1e-12)
     assert float(_on_device(None, errors, torch.zeros_like(counted))) == LEAST
+    # Segment Anything may find no region in a frame.
+    none = torch.zeros(1, 0)
+    for previous in (None, 0.3, torch.tensor(0.3, dtype=torch.float64)):
+        expected = running_median(previous, none, none.bool())
+        assert float(_on_device(previous, none, none.bool())) == pytest.approx(float(expected))
