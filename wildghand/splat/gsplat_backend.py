@@ -70,7 +70,12 @@ def _info(scene: FlatScene, meta: dict[str, Any]) -> dict[str, Any]:
         # makes, not a view of it.
         shape = (*scene.image_dims, *tail)
         info[name] = value if tuple(value.shape) == shape else value.reshape(shape)
-    info["visible"] = (info["radii"] > 0).all(-1).sum(-1)
+    shown = (info["radii"] > 0).all(-1)
+    info["visible"] = shown.sum(-1)
+    # gsplat writes neither place nor depth of what is culled, and reads neither in its backward
+    # pass; past autograd, so that the tensor stays the one whose gradient it makes.
+    info["means2d"].data.masked_fill_(~shown[..., None], 0.0)
+    info["depths"] = info["depths"].masked_fill(~shown, 0.0)
     return info
 
 

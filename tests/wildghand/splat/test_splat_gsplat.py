@@ -228,3 +228,25 @@ def test_auto_takes_gsplat_for_cuda_tensors() -> None:
     tensors = {name: value.float().cuda() for name, value in hand_scene().arguments.items()}
     *_, info = rasterize(**tensors, width=40, height=30)
     assert info["backend"] == "gsplat"
+
+
+def test_culled_gaussians_have_no_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    """gsplat leaves their places and depths as its memory was."""
+    drawn = StandIn.rasterization
+
+    def dirty(self: StandIn, *args: Any, **options: Any) -> Any:
+        image, alpha, info = drawn(self, *args, **options)
+        culled = (info["radii"] == 0).any(-1)
+        assert culled.any()
+        info["means2d"] = info["means2d"].masked_fill(culled[..., None], math.nan)
+        info["depths"] = info["depths"].masked_fill(culled, math.nan)
+        return image, alpha, info
+
+    monkeypatch.setattr(StandIn, "rasterization", dirty)
+    tensors = variant("one set")
+    tensors["means"] = tensors["means"].clone()
+    tensors["means"][3, 2] = -5.0
+    *_, info = through(monkeypatch, "1.5.3", tensors)
+    *_, truth = rasterize(**tensors, width=40, height=30, backend="reference")
+    for key in ("means2d", "depths"):
+        torch.testing.assert_close(info[key], truth[key])
