@@ -44,9 +44,16 @@ class ClipPoses(Found):
 
     @functools.cached_property
     def _rows(self) -> dict[str, dict[bytes, int]]:
-        """The row of each given pose, by side."""
+        """The row of each given pose that was changed, by side.
+
+        A frame without the hand may hold the pose of one with it, and is drawn as that one.
+        """
         return {
-            side: {row.tobytes(): number for number, row in enumerate(poses)}
+            side: {
+                row.tobytes(): number
+                for number, row in enumerate(poses)
+                if not np.array_equal(row, self.believed[side][number])
+            }
             for side, poses in self.given.items()
         }
 

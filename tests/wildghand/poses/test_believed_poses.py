@@ -144,6 +144,22 @@ def test_frames_without_the_hand_keep_their_numbers() -> None:
     assert (found.pose[valid] != given.pose[valid]).any()
 
 
+def test_a_pose_that_is_held_after_the_hand_was_lost_is_corrected() -> None:
+    """As importers fill frames without the hand: they hold the last pose."""
+    given, last = _with_errors(_truth(), 1.0), FRAMES - 4
+    pose, transl, valid = given.pose.copy(), given.transl.copy(), given.valid.copy()
+    pose[last + 1 :], transl[last + 1 :], valid[last + 1 :] = pose[last], transl[last], False
+    given = replace(given, pose=pose, transl=transl, valid=valid)
+    believed = _believed(given)
+    poses = ClipPoses.of({"right": given}, {"right": believed})
+    assert poses is not None
+    for frame in (last, FRAMES - 1):
+        told = poses.corrected({"right": given.at(frame, "right")})["right"]
+        np.testing.assert_allclose(told.pose, believed.pose[last], atol=1e-6)
+        np.testing.assert_allclose(told.transl, believed.transl[last], atol=1e-6)
+    assert np.abs(believed.pose[last] - given.pose[last]).max() > 1e-3
+
+
 def test_a_frame_is_corrected_alike_whichever_frames_come_with_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
