@@ -92,12 +92,18 @@ def _add_fit(parser: argparse.ArgumentParser) -> None:
 
 def _do_fit(args: argparse.Namespace) -> int:
     """Run the command, in one process or in those that torchrun started."""
+    from hwp_bench.base.errors import UsageError
     from hwp_bench.base.files import check_places
     from wildghand.fitting.parallel import run_in_world
     from wildghand.from_video.make import is_video
     from wildghand.gaussians.fit_loop import choose_device
     from wildghand.model.settings import read_settings
+    from wildghand.viewer.server import Address
 
+    if not args.live and address_of(args) != Address():
+        raise UsageError(
+            "is for --live", field="--host, --port", remedy="Give --live too, or leave it out."
+        )
     inputs = {
         "VIDEO|CAPTURE": args.source,
         "--landmarks": args.landmarks,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from tiny_fits import UNJUDGED
 
 from hwp_bench.capture import Capture
 from hwp_bench.methods.contract import Budget
+from wildghand.cli.main import main
 from wildghand.fitting import fit_capture
 from wildghand.fitting.components import make_fit
 from wildghand.fitting.fit import Fit
@@ -91,6 +93,15 @@ def test_the_turned_picture_is_that_of_a_camera_around_the_hand(
         drawn = avatar.render(hands, dataclasses.replace(camera, viewmat=viewmat))[..., :3]
         assert np.abs(turned - drawn).max() < 0.01
         assert (turned.max(axis=-1) > 0.1).mean() > 0.02
+
+
+def test_an_address_without_a_page_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["fit", str(tmp_path / "hand.mp4"), "--port", "9000"]) == 2
+    told = capsys.readouterr().err
+    assert "--port" in told
+    assert "Give --live" in told
 
 
 def test_the_avatar_turns_with_each_look(
