@@ -34,11 +34,18 @@ def render_clip(
     video: Path | None = None,
     overwrite: bool = False,
 ) -> dict[str, Any]:
-    """Draw frames into a folder, whole or not at all; `overwrite` replaces a folder of frames."""
+    """Draw frames into a folder, whole or not at all; `overwrite` replaces it and the video."""
     refuse_other(out, "frames", _holds_frames)
     check_places({"out": out, "video": video}, {"poses": capture.root}, replaces=overwrite)
     sides = shown_sides(avatar, capture)
     if video is not None:
+        if video.exists() and not overwrite:
+            raise UsageError(
+                "exists",
+                where=video,
+                field="--video",
+                remedy="Choose another name, or give --overwrite.",
+            )
         check_encoder()
     seconds, images = 0.0, []
     with atomic_folder(out, overwrite=overwrite, flag="--overwrite") as folder:

@@ -39,7 +39,7 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
     add("--range", metavar="A:B", help="frames A to B-1 only")
     add("--background", type=int, default=0, metavar="GREY", help="0 black to 255 white")
     add("--video", type=Path, metavar="MP4", help="also write a video")
-    add_ending(parser, "folder")
+    add_ending(parser, "folder or video")
 
 
 def _do_render(args: argparse.Namespace) -> int:

@@ -18,15 +18,20 @@ from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.render import render_clip
 
 
-def test_an_existing_folder_is_refused_with_the_option_that_replaces_it(
-    make_capture: CaptureMaker, tmp_path: Path
-) -> None:
-    capture = make_capture(frames=3)
-    avatar: Any = SimpleNamespace(
+def _blank(capture: Capture) -> Any:
+    """An avatar that draws nothing."""
+    return SimpleNamespace(
         sides=("right",),
         hand_model=capture.info.hand_model,
         render=lambda hands, camera: np.zeros((camera.height, camera.width, 4)),
     )
+
+
+def test_an_existing_folder_is_refused_with_the_option_that_replaces_it(
+    make_capture: CaptureMaker, tmp_path: Path
+) -> None:
+    capture = make_capture(frames=3)
+    avatar = _blank(capture)
     out = tmp_path / "frames"
     render_clip(avatar, capture, range(2), out)
     with pytest.raises(UsageError, match="--overwrite"):
@@ -37,6 +42,18 @@ def test_an_existing_folder_is_refused_with_the_option_that_replaces_it(
     with pytest.raises(UsageError, match="something else than frames"):
         render_clip(avatar, capture, range(1), out, overwrite=True)
     assert (out / "thesis.tex").is_file()
+
+
+def test_an_existing_video_is_not_replaced(make_capture: CaptureMaker, tmp_path: Path) -> None:
+    capture = make_capture(frames=3)
+    out, video = tmp_path / "frames", tmp_path / "hand.mp4"
+    video.write_bytes(b"my recording")
+    with pytest.raises(UsageError, match="--video: exists"):
+        render_clip(_blank(capture), capture, range(2), out, video=video)
+    assert video.read_bytes() == b"my recording"
+    assert not out.exists()
+    render_clip(_blank(capture), capture, range(2), out, video=video, overwrite=True)
+    assert video.read_bytes() != b"my recording"
 
 
 def test_every_frame_is_drawn_in_its_own_pose_over_the_background(
