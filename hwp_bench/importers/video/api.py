@@ -384,7 +384,10 @@ class _Turns:
             clips = [project_clip(fitted.model, source.windows) for fitted in self._fits]
             projected = ProjectedHands(clips, self._landmarks)
             if self._glimpse is not None:
-                self._glimpse([paint_hand(clip, images.frames, source.detected) for clip in clips])
+                shown = zip(clips, self._landmarks, strict=True)
+                self._glimpse(
+                    [paint_hand(clip, images.frames, one.detected) for clip, one in shown]
+                )
             seen, own = source.detected, source.own_masks
             masks = cut_masks(images, projected, seen, size, trust, own, edge, update)
         return projected, masks

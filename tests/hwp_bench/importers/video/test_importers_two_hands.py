@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -27,6 +28,7 @@ from hwp_bench.importers.video import (
     VideoImport,
     import_video,
 )
+from hwp_bench.importers.video.glimpse import PaintedHand, paint_hand
 from hwp_bench.importers.video.solve import Footage, fit_landmarks, share_camera
 from hwp_bench.importers.video.source import read_source
 from hwp_bench.results import read_results
@@ -120,6 +122,22 @@ def test_masks_are_of_both_hands(imported: ImportedClip, folder: Path, clip: Two
         matrix = np.array([[scale, 0, 0.5 * scale - 0.5 - x], [0, scale, 0.5 * scale - 0.5 - y]])
         warped = cv2.warpAffine(true, matrix, (128, 128)) > 127
         assert overlap(capture.mask(frame) > 127, warped) > 0.88
+
+
+def test_each_hand_is_shown_in_frames_that_it_is_in(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[int] = []
+
+    def paint(clip: Any, images: np.ndarray, detected: np.ndarray) -> PaintedHand:
+        asked.append(int(detected.sum()))
+        return paint_hand(clip, images, detected)
+
+    monkeypatch.setattr("hwp_bench.importers.video.api.paint_hand", paint)
+    video, landmarks = write_two_hands(tmp_path, make_two_hands(FRAMES), (), range(4, 12))
+    options = VideoImport(size=64, fit=landmark_import(30, outline_steps=3), focal=FOCAL)
+    import_video(video, landmarks, tmp_path / "out", options, glimpse=lambda hands: None)
+    assert set(asked) == {FRAMES, FRAMES - 8}
 
 
 def test_two_hands_get_one_focal_length(clip: TwoHandClip) -> None:
