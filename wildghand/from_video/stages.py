@@ -276,7 +276,23 @@ def import_options(job: VideoJob) -> VideoImport:
         return replace(
             choices, frames=frames, side=next(side for side in seen if side not in few) or "auto"
         )
-    return replace(choices, frames=frames)
+    together = int(np.all([hand.detected[::step] for hand in hands.values()], axis=0).sum())
+    if together >= FEWEST:
+        return replace(choices, frames=frames)
+    # A fit takes the frames that show all of its hands.
+    if job.options.side == "both":
+        raise BadInput(
+            f"shows both hands together in {together} of {of}, an avatar of two needs {FEWEST} or "
+            "more",
+            where=job.video,
+            remedy="Film the hands together, or make an avatar of one.",
+        )
+    side, other = sorted(seen, key=lambda name: -seen[name])
+    notice(
+        f"Both hands are in {together} of {of} only; the {other} hand is left out (--side {other} "
+        "takes it instead)."
+    )
+    return replace(choices, frames=frames, side=side or "auto")
 
 
 class FitStage(Stage):
@@ -317,9 +333,12 @@ class FitStage(Stage):
 
     def expected(self, job: VideoJob) -> float:
         settings = read_settings(job.options.method_settings())
-        steps = job.options.steps or settings.schedule.steps
-        # A step of 12,337 Gaussians takes 50 ms, what goes before the first 25 s.
-        spent = 0.05 * steps * (0.3 + 0.7 * settings.gaussians / 12_337)
+        schedule, batch = settings.schedule, settings.schedule.batch or 1
+        drawn = schedule.epochs * job.options.most_frames or schedule.steps * batch
+        if job.options.steps:
+            drawn = job.options.steps * batch
+        # A frame of 12,337 Gaussians takes 50 ms, what goes before the first step 25 s.
+        spent = 0.05 * drawn * (0.3 + 0.7 * settings.gaussians / 12_337)
         limit = job.options.seconds
         return 25.0 + (spent if limit is None else min(spent, limit))
 

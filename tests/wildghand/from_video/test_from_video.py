@@ -360,6 +360,36 @@ def test_two_hands_by_default(tmp_path: Path, capsys: pytest.CaptureFixture[str]
         make_avatar(video, tmp_path / "other", replace(options, side="both"))
 
 
+def test_hands_that_are_hardly_seen_together_are_not_fitted_together(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """First one hand is shown, then the other, with a few frames of both between."""
+    frames = 3 * COUNT
+    video, landmarks = write_two_hands(tmp_path, make_two_hands(frames), (), range(0))
+    tracks = read_hand_tracks(landmarks)
+    assert tracks is not None
+    right = np.arange(frames) < 2 * COUNT
+    left = np.arange(frames) >= 2 * COUNT - 8
+    seen = np.where(tracks.right > 0.5, right, left)
+    score = np.where(seen, tracks.score, 0.0).astype(np.float32)
+    write_hand_tracks(landmarks, replace(tracks, score=score))
+    sides = read_sides(landmarks, "auto", min_score=0.5).values()
+    both = int(np.all([hand.detected for hand in sides], axis=0).sum())
+    assert 8 <= both <= 9
+    options = choices(tmp_path, landmarks=landmarks)
+
+    def chosen(**changes: Any) -> str:
+        job = VideoJob(video, tmp_path / "mine", replace(options, **changes))
+        return import_options(job).side
+
+    assert chosen() == "right"
+    told = " ".join(capsys.readouterr().err.split())
+    assert f"Both hands are in {both} of {frames} frames only; the left hand is left out" in told
+    with pytest.raises(BadInput, match=f"both hands together in {both} of {frames} frames"):
+        chosen(side="both")
+    assert chosen(side="left") == "left"
+
+
 def test_too_few_frames_with_a_hand(folder: Path) -> None:
     clip = make_clip(COUNT)
     score = np.where(np.arange(COUNT) < 5, 0.9, 0.0)

@@ -27,7 +27,7 @@ from wildghand.from_video.run import (
     stride,
     write_record,
 )
-from wildghand.from_video.stages import TrackStage
+from wildghand.from_video.stages import FitStage, TrackStage
 
 NAMES = ("one", "two", "three")
 
@@ -238,6 +238,37 @@ def test_a_folder_without_a_record_is_refused_by_what_is_in_it(
         make_avatar(tmp_path / "hand.mp4", tmp_path / "hand")
     assert remedy in str(caught.value)
     assert ("--overwrite" in str(caught.value)) == (remedy == "--overwrite")
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"prior": "/none"},
+        {"pao.hand": "sam:/none"},
+        {"perceptual": "vgg19:/none", "terms.perceptual": 0.1},
+        {"perceptual": "vgg19:/none"},
+    ],
+    ids=str,
+)
+def test_files_of_the_fit_are_looked_for_before_the_video_is_read(
+    settings: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(make, "probe", lambda video: pytest.fail("the video was read"))
+    with pytest.raises((BadInput, UsageError), match=r"prior|exist|terms\.perceptual is 0"):
+        make_avatar(tmp_path / "hand.mp4", tmp_path / "hand", VideoFit(settings=settings))
+    assert not (tmp_path / "hand").exists()
+
+
+def test_epochs_are_expected_to_take_their_steps(tmp_path: Path) -> None:
+    def seconds(**settings: Any) -> float:
+        options = VideoFit(settings=settings)
+        return FitStage().expected(VideoJob(tmp_path / "hand.mp4", tmp_path / "hand", options))
+
+    # Ten looks at about 300 frames, two in a step.
+    schedule = {"schedule.epochs": 10, "schedule.batch": 2}
+    counted = {"schedule.steps": 3000, "schedule.batch": 1}
+    assert seconds(**schedule) == pytest.approx(seconds(**counted))
+    assert seconds(**schedule) > 2 * seconds()
 
 
 @pytest.mark.parametrize(("count", "quick"), [(16, False), (449, False), (151, True), (9000, True)])
