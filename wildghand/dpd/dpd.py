@@ -98,8 +98,8 @@ class DpdSettings:
 
     #: Component: explain perturbations as biases of the attributes.
     enabled: bool = True
-    #: Addition: a field of biases over place and normal, a gain of each frame's colours, and
-    #: temporal weights that start where the pre-pass's weights of the frames put them.
+    #: Addition: a field of biases over place and normal, a gain of each frame's colours, and by the
+    #: pre-pass where temporal weights start and are held, and which frames leave biases out.
     additions: bool = True
     #: The authors' pose head by time: small corrections of each frame's pose from its embedding.
     poses: bool = False
@@ -113,8 +113,8 @@ class DpdSettings:
     #: Weight of the square of what separates the log gains of a frame's channels: exposure wanders
     #: more than white balance, and a palm that only perturbed frames show is redder by itself.
     tint_weight: ClassVar[float] = 1.0
-    #: Chance that a frame's biases are left out of a step, the paper's. With the pre-pass, all of
-    #: clean frames are.
+    #: Chance that a frame's biases are left out of a step, the paper's. With the pre-pass and the
+    #: additions it is 1 in clean frames and 0 in others.
     omega_dropout: ClassVar[float] = 0.3
     #: Weight of the squared distance of the temporal weights from what the pre-pass says: any
     #: factor may move between omega and varphi, so that it need not be tuned.
