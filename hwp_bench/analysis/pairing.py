@@ -11,7 +11,14 @@ from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import sha256_json
 from hwp_bench.metrics.score import CaptureScores, Scores, aggregate
 from hwp_bench.results import Results
-from hwp_bench.results.schema import CaptureResult, differing_makers, differing_settings
+from hwp_bench.results.schema import (
+    CaptureResult,
+    budget_text,
+    differing_makers,
+    differing_settings,
+    shown_files,
+    without_places,
+)
 from hwp_bench.taxonomy import PERTURBATIONS
 
 #: Scope of the headline: every perturbation counts the same, as the macro mean of the tables.
@@ -44,12 +51,12 @@ class MethodRuns:
 def same_but_seed(result: Results) -> str:
     """Return a digest (hex) that two evaluations share when they differ in nothing but the seed.
 
-    Method, preset, settings, budget, kind of training frames and suite count; machine and captures
-    do not.
+    Method, preset, settings, files that it was shown, budget, kind of training frames and suite
+    count; machine, captures and the places of files do not.
     """
-    method = result.method
-    state = [method.name, method.title, method.digest, method.preset, method.settings]
-    return sha256_json([state, result.budget, result.frames, result.suite])
+    method, settings = result.method, without_places(result.method.settings)
+    state = [method.name, method.title, method.digest, method.preset, settings]
+    return sha256_json([state, shown_files(result), result.budget, result.frames, result.suite])
 
 
 def group_runs(results: Sequence[Results]) -> list[MethodRuns]:
@@ -92,12 +99,11 @@ def _labels(results: Sequence[Results]) -> list[str]:
 
 
 def _state(result: Results) -> str:
-    seconds, steps = result.budget.get("seconds"), result.budget.get("steps")
     parts = [
         result.method.preset,
         f"{result.frames} frames" if result.frames != "perturbed" else "",
-        f"{seconds:g} s" if seconds else "",
-        f"{steps} steps" if steps else "",
+        budget_text(result.budget) if any(result.budget.values()) else "",
+        *(f"files {digest[:8]}" for digest in shown_files(result)),
     ]
     return ", ".join(filter(None, parts))
 

@@ -31,7 +31,14 @@ from hwp_bench.methods.manifest import MethodManifest, shipped_methods
 from hwp_bench.metrics import HWP_V1, PROTOCOLS, metric_names, penalty
 from hwp_bench.metrics.score import aggregate
 from hwp_bench.results import Results
-from hwp_bench.results.schema import MAX_BYTES, CaptureResult, TrainingData, score_rows
+from hwp_bench.results.schema import (
+    MAX_BYTES,
+    UNDECLARED,
+    CaptureResult,
+    TrainingData,
+    score_rows,
+    without_places,
+)
 from hwp_bench.suites.suite import find_missing, find_wrong_labels, suite_scenes
 from hwp_bench.taxonomy import SUITES as ALL_SUITES
 
@@ -141,6 +148,13 @@ def _check_one(entry: Entry) -> None:
             where=entry.name,
             field="method.training",
             remedy="Train without the suite's scenes; `wild-dev` and your own scenes are free.",
+        )
+    if UNDECLARED in results.method.training.private:
+        raise UsageError(
+            "does not say what its method was trained on",
+            where=entry.name,
+            field="method.training",
+            remedy="Write a method directory whose method.toml says it, and evaluate that.",
         )
     if results.frames != "perturbed":
         raise UsageError(
@@ -426,12 +440,12 @@ def repeats(first: Results, second: Results) -> bool:
         return False
     one, other = (
         (
-            item.method,
+            replace(item.method, settings=without_places(item.method.settings)),
             item.suite,
             item.seed,
             item.budget,
             item.frames,
-            sorted((c.id, c.digest, c.split_digest) for c in item.captures),
+            sorted((c.id, c.digest, c.split_digest, c.exposed or "") for c in item.captures),
         )
         for item in (on_current_data(first), on_current_data(second))
     )

@@ -20,11 +20,12 @@ from typing import Any
 from hwp_bench.base.errors import UsageError, one_line
 from hwp_bench.base.files import atomic_write
 from hwp_bench.methods.manifest import MANIFEST, SCHEMA
+from hwp_bench.results.schema import UNDECLARED
 
 # The class says nothing of its training, so that a result must not say "none".
 _MANIFEST = """schema = "{schema}"
 name = "{name}"
-training = {{private = ["not declared"]}}
+training = {{private = ["{undeclared}"]}}
 [entry]
 python = "method_source:{name}"
 """
@@ -54,7 +55,9 @@ def write_method(factory: Any, root: Path) -> Path:
         )
     body = "\n\n".join(("from __future__ import annotations", *statements)) + "\n"
     atomic_write(root / name / "method_source.py", body)
-    return atomic_write(root / name / MANIFEST, _MANIFEST.format(schema=SCHEMA, name=name)).parent
+    return atomic_write(
+        root / name / MANIFEST, _MANIFEST.format(schema=SCHEMA, name=name, undeclared=UNDECLARED)
+    ).parent
 
 
 def _sources(module: Any) -> list[tuple[str, ast.stmt]]:

@@ -23,6 +23,7 @@ from hwp_bench.results.schema import (
     differing_settings,
     per_second,
     score_rows,
+    shown_files,
 )
 from hwp_bench.suites.suite import lost_clips
 from hwp_bench.taxonomy import PERTURBATIONS, perturbation
@@ -226,6 +227,7 @@ _TELLING: tuple[Callable[[Results], str], ...] = (
     lambda result: f"{result.frames} frames",
     lambda result: budget_text(result.budget),
     _seed,
+    lambda result: ", ".join(f"files {one[:8]}" for one in shown_files(result)) or "no files",
     lambda result: result.method.digest[:8],
 )
 

@@ -10,6 +10,7 @@ import json
 import math
 import os
 import platform
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -21,7 +22,7 @@ from msgspec import Meta
 from hwp_bench.base import packages
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import canonical_json, files_digest
-from hwp_bench.base.records import Count, Digest, Line, Message, Moment, Seconds, Seed
+from hwp_bench.base.records import Count, Digest, Line, Message, Moment, Seconds, Seed, flattened
 from hwp_bench.base.tables import Table
 from hwp_bench.metrics import METRICS
 from hwp_bench.metrics.score import CaptureScores, Scores, aggregate
@@ -183,6 +184,10 @@ TRAINING_KINDS = {
     "public": "public data sets",
     "private": "private data",
 }
+
+
+#: What `TrainingData.private` holds where nobody has declared anything.
+UNDECLARED = "not declared"
 
 
 @dataclass(frozen=True)
@@ -395,6 +400,23 @@ def differing_makers(first: CaptureResult, second: CaptureResult) -> str:
         return ""
     makers = [item.made_by or "an importer that is not stated" for item in (first, second)]
     return f": made by {makers[0]}, and by {makers[1]}"
+
+
+def shown_files(results: Results) -> list[str]:
+    """Return digests of the files that the method was shown besides its folder and the request."""
+    return sorted({capture.exposed for capture in results.captures if capture.exposed})
+
+
+# As `hwp_bench.methods.manifest.resolve_files` writes a file or folder of a person.
+_FILE = re.compile(r"\A([a-z][a-z0-9-]*):/.*\Z", re.DOTALL)
+
+
+def without_places(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings in which a file is its kind alone; `shown_files` has its content."""
+    return {
+        name: _FILE.sub(r"\1:", value) if isinstance(value, str) else value
+        for name, value in flattened(settings)
+    }
 
 
 def differing_settings(results: Sequence[Results]) -> list[str]:

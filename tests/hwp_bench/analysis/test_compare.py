@@ -150,6 +150,33 @@ def test_labels_are_told_apart() -> None:
     assert [run.label for run in group_runs([base, code])][1] == "Mine (default, dddddddd)"
 
 
+def test_a_limit_of_steps_that_seconds_lift_is_not_told() -> None:
+    base = made_results("mine", noise)
+    given = [replace(base, budget={"seconds": s, "steps": 100_000}) for s in (16.0, 64.0)]
+    assert [run.label for run in group_runs(given)] == [
+        "Mine (default, 16 s)",
+        "Mine (default, 64 s)",
+    ]
+
+
+def test_other_files_that_a_method_was_shown_make_another_method() -> None:
+    def shown(letter: str, place: str, seed: int = 0) -> Results:
+        made = made_results("mine", noise, seed=seed)
+        captures = [replace(one, exposed=letter * 64) for one in made.captures]
+        method = replace(made.method, settings={"regions": f"sam:{place}"})
+        return replace(made, method=method, captures=captures)
+
+    runs = group_runs([shown("a", "/a/sam.pth"), shown("b", "/a/sam.pth")])
+    assert [run.label for run in runs] == [
+        "Mine (default, files aaaaaaaa)",
+        "Mine (default, files bbbbbbbb)",
+    ]
+    assert len(group_runs([shown("a", "/a/sam.pth"), shown("b", "/a/sam.pth", 1)])) == 2
+    # Their place is another on every machine.
+    (run,) = group_runs([shown("a", "/a/sam.pth"), shown("a", "/srv/sam.pth", 1)])
+    assert sorted(run.seeds) == [0, 1]
+
+
 def test_the_command_prints_tables_and_json_and_refuses(tmp_path: Path, capsys) -> None:
     paths = []
     for name, gain in (("mine", 2.0), ("plain", 0.0)):

@@ -28,6 +28,7 @@ from hwp_bench.leaderboard.rules import (
     check_names,
     off_the_data,
     register,
+    repeats,
     sound_entries,
 )
 from hwp_bench.leaderboard.submit import add_entries
@@ -418,3 +419,15 @@ def test_a_revision_of_somebody_elses_row_is_a_row_of_its_own(tmp_path: Path, ca
     assert "which somebody else stands for" in capsys.readouterr().err
     labels = {m.label: m.level for m in method_rows(sound_entries(tmp_path))}
     assert labels == {"Mine (by A)": "rescored", "Mine (by B)": "self-reported"}
+
+
+def test_a_second_run_has_the_files_of_the_first_at_any_place() -> None:
+    def ran(place: str, letter: str, hour: int) -> Results:
+        base = complete_results("mine", started=f"2026-01-01T0{hour}:00:00+00:00")
+        method = replace(base.method, settings={"regions": f"sam:{place}"})
+        captures = [replace(one, exposed=letter * 64) for one in base.captures]
+        return replace(base, method=method, captures=captures)
+
+    first = ran("/home/a/sam.pth", "a", 1)
+    assert repeats(first, ran("/srv/sam.pth", "a", 2))
+    assert not repeats(first, ran("/home/a/sam.pth", "b", 2))

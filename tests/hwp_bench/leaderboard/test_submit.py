@@ -21,6 +21,8 @@ from hwp_bench.cli.main import main
 from hwp_bench.evaluation.scoring import predictions_digest, read_predictions
 from hwp_bench.leaderboard.entries import digest, make_entry, read_entries, write_entry
 from hwp_bench.leaderboard.submit import confirm, entry_of
+from hwp_bench.methods.manifest import read_manifest
+from hwp_bench.methods.source import write_method
 from hwp_bench.results import read_results, write_results
 from hwp_bench.sim.produce.capture import suite
 
@@ -172,6 +174,19 @@ def test_results_that_cannot_be_ranked_are_not_submitted(run: Path, tmp_path, ca
         write_results(run / "results.json", replace(whole, **changes))
         assert submit(run, tmp_path / "out") == status
         assert problem in capsys.readouterr().err
+
+
+def test_a_result_that_declares_no_training_data_is_not_submitted(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As that of a class that Python code evaluated."""
+    source = write_method(complete_results, tmp_path / "class")
+    training = read_manifest(source).training
+    whole = read_results(run / "results.json")
+    method = replace(whole.method, training=training)
+    write_results(run / "results.json", replace(whole, method=method))
+    assert submit(run, tmp_path / "out") == 2
+    assert "does not say what its method was trained on" in capsys.readouterr().err
 
 
 @pytest.fixture
