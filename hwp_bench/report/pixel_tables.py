@@ -5,7 +5,7 @@ By novelty of the pixels, by what is drawn outside, and by how sharp it is.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -205,7 +205,7 @@ def novelty_table(sources: Sequence[ResultsSource], captures: Mapping[str, Captu
     Errors are pooled over the scored pixels of all frames of all captures. Frames of which one
     method has no sound prediction are left out for all.
     """
-    totals = _pooled(sources, captures)
+    totals, used = _pooled(sources, captures)
     if not any(pixels.any() for pixels, _ in totals):
         raise UsageError(
             "none of these captures, or none of the predictions, is at hand",
@@ -233,22 +233,25 @@ def novelty_table(sources: Sequence[ResultsSource], captures: Mapping[str, Captu
         (Column("PSNR [dB]", 2, True), scores),
     ]
     notes = (
-        "Classes of the scored pixels of all test frames; the squared error is pooled in each.",
+        "Classes of the scored pixels of test frames; the squared error is pooled in each.",
         "Angle: between a pixel's normal and the nearest normal of the same 4 mm place in a "
         "training frame. Seen: share of the training frames whose mask shows the place.",
         _COMMON,
+        *_left_out(sources, used),
     )
     return table_of("By novelty", columns, notes, breaks=block_breaks(keys))
 
 
 def _pooled(
     sources: Sequence[ResultsSource], captures: Mapping[str, Capture]
-) -> list[tuple[np.ndarray, np.ndarray]]:
+) -> tuple[list[tuple[np.ndarray, np.ndarray]], set[str]]:
     """Scored pixels, and their squared error, of each of `CLASSES`, for each evaluation.
 
-    Novelty is the captures' own, so that each of them is measured once for all methods.
+    Returned too are the digests of the captures that they are of. Novelty is the captures' own, so
+    that each of them is measured once for all methods.
     """
     totals = [(np.zeros(len(CLASSES)), np.zeros(len(CLASSES))) for _ in sources]
+    used = set()
     for digest, capture in track(captures.items(), "Novelty", len(captures)):
         split = split_for(capture.info.id, len(capture))
         runs = []
@@ -265,6 +268,7 @@ def _pooled(
         frames = sorted(set.intersection(*(set(files) for files, _ in runs))) if runs else []
         if not frames:
             continue
+        used.add(digest)
         for novelty in measure_novelty(capture, split, frames):
             mask, exact = capture.scoring_mask(novelty.frame)
             region = scored_pixels(mask, erosion=HWP_V1.mask_erosion, coverage=exact)
@@ -276,7 +280,19 @@ def _pooled(
                 for index in classes:
                     np.add.at(pixels, index, 1.0)
                     np.add.at(errors, index, error)
-    return totals
+    return totals, used
+
+
+def _left_out(sources: Sequence[ResultsSource], used: Set[str]) -> list[str]:
+    """Name the captures of the results that a table is not of, in a note."""
+    every = {item.digest: item.id for source in sources for item in source.results.captures}
+    lost = [name for digest, name in every.items() if digest not in used]
+    if not lost:
+        return []
+    return [
+        f"Of {len(every) - len(lost)} of {len(every)} captures. Not at hand with predictions of "
+        f"every method, or with nothing to measure: {', '.join(lost)}."
+    ]
 
 
 def classes_of(novelty: Novelty, region: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -313,7 +329,7 @@ def outline_table(sources: Sequence[ResultsSource], captures: Mapping[str, Captu
     Frames of which one method has no sound prediction are left out for all, and captures that are
     not at hand for every method.
     """
-    found = _score_again(sources, captures, "Outlines", outline_scores)
+    found, used = _score_again(sources, captures, "Outlines", outline_scores)
     means = [OutlineScores(*np.mean(scores, axis=0)) for scores in found]
     columns: list[Filled] = [
         (Column("Method"), labels([source.results for source in sources])),
@@ -322,7 +338,7 @@ def outline_table(sources: Sequence[ResultsSource], captures: Mapping[str, Captu
         (Column("With the outside [dB]", 2, True), [mean.psnr_with_outside for mean in means]),
         (Column("If spread [dB]", 2), [mean.psnr_spread for mean in means]),
     ]
-    return table_of("By outline", columns, _NOTES)
+    return table_of("By outline", columns, (*_NOTES, *_left_out(sources, set(used))))
 
 
 #: Standard deviations of the blurs whose differences are the bands, px.
@@ -399,10 +415,10 @@ def sharpness_table(sources: Sequence[ResultsSource], captures: Mapping[str, Cap
     Frames of which one method has no sound prediction are left out for all, and captures that are
     not at hand for every method, or whose truth has nothing in a band.
     """
-    found = _score_again(sources, captures, "Sharpness", band_power)
+    found, used = _score_again(sources, captures, "Sharpness", band_power)
     # (methods, captures, 3, B)
     power = np.array(found)
-    textured = (power[0, :, 1] > _NOTHING).all(axis=1)
+    textured: np.ndarray = (power[0, :, 1] > _NOTHING).all(axis=1)
     if not textured.any():
         raise UsageError("the hands of these captures have no structure", field="--capture")
     drawn, true, both = np.moveaxis(power[:, textured], 2, 0)
@@ -416,7 +432,8 @@ def sharpness_table(sources: Sequence[ResultsSource], captures: Mapping[str, Cap
         for index, name in enumerate(BANDS):
             column = Column(name, 2, better, group)
             columns.append((column, [float(value) for value in values[:, index]]))
-    return table_of("By sharpness", columns, _SHARP_NOTES)
+    measured = {digest for digest, one in zip(used, textured.tolist(), strict=True) if one}
+    return table_of("By sharpness", columns, (*_SHARP_NOTES, *_left_out(sources, measured)))
 
 
 def _score_again(
@@ -424,11 +441,16 @@ def _score_again(
     captures: Mapping[str, Capture],
     what: str,
     score: Callable[..., Sequence[float | np.ndarray] | None],
-) -> list[list[np.ndarray]]:
-    """Each method's means over the test frames of every capture that all methods have."""
+) -> tuple[list[list[np.ndarray]], list[str]]:
+    """Each method's means over the test frames of every capture that all methods have.
+
+    Returned too are the digests of these captures.
+    """
     found: list[list[np.ndarray]] = [[] for _ in sources]
+    used = []
     for digest, capture in track(captures.items(), what, len(captures)):
         if means := _means(sources, digest, capture, score):
+            used.append(digest)
             for scores, mean in zip(found, means, strict=True):
                 scores.append(mean)
     if not found or not found[0]:
@@ -437,7 +459,7 @@ def _score_again(
             field="--capture",
             remedy="Name the capture folders, and results folders that hold predictions.",
         )
-    return found
+    return found, used
 
 
 def _means(

@@ -32,7 +32,7 @@ from hwp_bench.report.pixel_tables import (
     spread_outwards,
 )
 from hwp_bench.report.requested_table import TableRequest, make_table
-from hwp_bench.results import Results
+from hwp_bench.results import Results, read_results, write_results
 
 
 @pytest.fixture
@@ -332,6 +332,29 @@ def test_errors_are_pooled_by_class(
                 assert row[5] == pytest.approx(psnr, abs=1e-6)
         shares = [row[4] for row in rows if row[2] == "Off"]
         assert sum(shares) == pytest.approx(100.0)
+
+
+@pytest.mark.parametrize("by", ["outline", "novelty", "sharpness"])
+def test_captures_that_are_not_at_hand_are_named(
+    by: str,
+    make_painted: Callable[..., Capture],
+    make_results: Callable[..., Results],
+    tmp_path: Path,
+) -> None:
+    capture = make_painted()
+    folder = drawn_results(capture, tmp_path / "a", make_results("mine"), capture.frame)
+
+    def told() -> list[str]:
+        table = make_table(TableRequest([folder], by=by, captures=[capture.root]))
+        return [note for note in table.notes if note.startswith("Of ")]
+
+    assert told() == []
+    results = read_results(folder)
+    far = replace(results.captures[0], id="far", digest="f" * 64)
+    write_results(folder / "results.json", replace(results, captures=[*results.captures, far]))
+    (note,) = told()
+    assert note.startswith("Of 1 of 2 captures.")
+    assert note.endswith(": far.")
 
 
 def test_it_needs_captures_and_predictions(
