@@ -33,7 +33,7 @@ def outcome_lines(out: Path, results: Results, head: str = "") -> list[str]:
             for text in (failure_text(capture), free_view_text(capture))
             if text
         ]
-        if capture.failure and (folder / LOG).is_file():
+        if capture.failed_frames and (folder / LOG).is_file():
             lines.append(f"log: {folder / LOG}")
         lines += [f"warning: {head}{capture.id}: {text}" for text in read_warnings(folder)]
     lines += [f"warning: {head}{results.suite} {text}" for text in lost_clips(results)]

@@ -34,6 +34,15 @@ def test_many_bad_frames_are_bounded_and_counted() -> None:
     assert "900 of 900 frames" in text
 
 
+def test_the_log_of_frames_that_were_not_drawn_is_named(tmp_path: Path) -> None:
+    lost = _capture([None, "000001.png: does not exist"])
+    log = tmp_path / "captures" / lost.id / "log.txt"
+    log.parent.mkdir(parents=True)
+    log.write_text("ValueError")
+    results = replace(results_example(), captures=[lost])
+    assert f"log: {log}" in outcome_lines(tmp_path, results)
+
+
 def test_sound_captures_say_nothing(tmp_path: Path) -> None:
     assert outcome_lines(tmp_path, results_example()) == []
 
