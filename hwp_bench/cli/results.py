@@ -216,6 +216,13 @@ def _curves(args: argparse.Namespace) -> int:
     sources = read_sources(args.results, repeats=False)
     check_places({"--out": args.out}, {"RESULTS": source_folders(sources)})
     groups = data_groups(sources)
+    data = {data_key(group.sources[0].results) for group in groups}
+    if len(groups) > 1 and reference is not None and data_key(reference.first) not in data:
+        raise UsageError(
+            "is on other data than every result",
+            field="--reference",
+            remedy="Name a result on the captures of one of them.",
+        )
     budgets = sorted(set(args.budgets))
     for group in groups:
         results = [source.results for source in group.sources]

@@ -196,6 +196,9 @@ def test_the_command_prints_writes_and_refuses(tmp_path: Path, capsys) -> None:
     assert {path.name for path in Path(out, "B").iterdir()} >= {"pareto.svg", "pareto.png"}
     assert main(["curves", mine, "--reference", few, "-o", out]) == 2
     assert "not evaluated on the same captures" in capsys.readouterr().err
+    write_results(tmp_path / "one" / "results.json", doubling("one", captures=1))
+    assert main(["curves", mine, few, "--reference", str(tmp_path / "one"), "-o", out]) == 2
+    assert "on other data than every result" in capsys.readouterr().err
     # Data without a curve are named and left out.
     write_results(
         tmp_path / "bare" / "results.json", made_results("bare", flat, captures=3, curve=[])
