@@ -593,9 +593,10 @@ def _entries(root: Path, skip: Sequence[str]) -> Iterator[tuple[str, Path]]:
 
     for folder, folders, files in os.walk(root, onerror=refuse):
         top = Path(folder) == root
-        left_out = LEFT_OUT | set(skip) if top else LEFT_OUT
-        folders[:] = [name for name in folders if name not in left_out]
-        for name in (*folders, *(file for file in files if file not in left_out)):
+        named = set(skip) if top else set()
+        folders[:] = [name for name in folders if name not in LEFT_OUT | named]
+        # A file of a name in LEFT_OUT, as `.git` of a submodule, is part of a method's digest.
+        for name in (*folders, *(file for file in files if file not in named)):
             path = Path(folder) / name
             facts = path.lstat()
             if not (stat.S_ISREG(facts.st_mode) or stat.S_ISDIR(facts.st_mode)):

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hwp_bench.base.errors import BadInput, HwpError
+from hwp_bench.methods.contents import method_files
 from hwp_bench.run.engine.ray import Parcel, folder_digest, pack, unpack
 
 NAMES = st.text("abcxyz", min_size=1, max_size=3)
@@ -32,6 +33,14 @@ def write_tree(root: Path, tree: dict[tuple[str, str], bytes]) -> Path:
 def content(root: Path) -> dict[str, bytes | None]:
     paths = root.rglob("*")
     return {str(p.relative_to(root)): p.read_bytes() if p.is_file() else None for p in paths}
+
+
+def test_a_file_that_is_named_like_a_folder_of_git_arrives(tmp_path: Path) -> None:
+    """Oracle: the digest of a method, which counts it."""
+    root = write_tree(tmp_path / "a", {("", "x"): b"1"})
+    (root / ".git").write_text("gitdir: ../.git/modules/a")
+    unpack(pack(root), tmp_path / "b")
+    assert method_files(tmp_path / "b") == method_files(root)
 
 
 @settings(max_examples=40, deadline=None)
