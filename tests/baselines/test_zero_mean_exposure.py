@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fitted_parts import fit_parts, material_of
+from fitted_parts import batch_of, fit_parts, material_of
 from painted import (
     FRAMES,
     QUICK,
@@ -182,3 +182,19 @@ def test_the_camera_s_exposure_is_told_from_the_hand(
     )
     assert ours > plain + 8.0, (plain, ours)
     assert ours > without + 5.0, (without, ours)
+
+
+def test_what_the_controller_has_to_learn_is_no_divergence(
+    make_training: Callable[..., TrainingCapture],
+) -> None:
+    """Oracle: the loss before the controller begins."""
+    settings = ZeroMeanExposureMethod(SETTINGS).settings
+    recipe = ZeroMeanExposureRecipe(material_of(make_training()), settings)
+    recipe.numbers[::2], recipe.numbers[1::2] = 0.5, -0.5
+    losses = []
+    for fraction in (0.0, 0.99):
+        batch = batch_of(recipe.material, 0, fraction=fraction)
+        with torch.no_grad():
+            drawing = recipe.draw(batch)
+            losses.append(float(recipe.loss(batch, drawing, recipe.weights(batch, drawing))))
+    assert losses[1] == pytest.approx(losses[0], rel=1e-6)

@@ -179,7 +179,9 @@ class ZeroMeanExposureRecipe(PlainRecipe[ZeroMeanExposureSettings]):
         rows = drawn[torch.randint(len(drawn), (REPLAYED,), generator=self._random)]
         rows = rows.to(self.device)
         wrong = predict(self._seen[rows], self.controller) - self.numbers[rows].detach()
-        return loss + CONTROLLER * wrong.square().mean()
+        own = CONTROLLER * wrong.square().mean()
+        # Its gradient alone: a loss that begins within the fit would be taken for divergence.
+        return loss + (own - own.detach())
 
     @torch.no_grad()
     def move_back(self, batch: Batch) -> None:
