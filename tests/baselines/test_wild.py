@@ -185,6 +185,19 @@ def test_before_its_share_of_the_fit_nothing_is_left_out(make_training: Training
             assert bool((weights[hand] > 0.0).all()) is kept
 
 
+def test_nerf_w_draws_what_its_loss_compares(make_training: TrainingMaker) -> None:
+    """Oracle: the paper's loss, with the likelihood that is tested above."""
+    recipe = wild_recipe(make_training, uncertainty="nerf-w", error_unit=0.3)
+    batch = batch_of(recipe.material, 0)
+    drawing = recipe.draw(batch)
+    assert drawing.shared.shape[-1] == 0
+    weights = recipe.weights(batch, drawing)
+    square = ((drawing.image - batch.images) / 0.3).square().mean(dim=-1)
+    expected = (gauss_loss(square, drawing.uncertainty, LEAST) * weights).mean()
+    expected = expected + 0.01 * drawing.transient
+    torch.testing.assert_close(recipe.loss(batch, drawing, weights), expected)
+
+
 SETTINGS = {**QUICK, "steps": 150}
 
 

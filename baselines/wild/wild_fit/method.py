@@ -188,7 +188,7 @@ class WildSettings(FitSettings):
     hidden: int = number(128, 1, 4096)
     #: Factor on the network's gains and offsets.
     tone_scale: float = number(1.0, 0.0, 100.0)
-    #: Whether D-SSIM compares the colours without the frame's appearance.
+    #: Whether D-SSIM compares the colours without the frame's appearance; `nerf-w` has no D-SSIM.
     plain_dssim: bool = True
     #: Adam step of the frames' numbers.
     frame_rate: float = 0.01
@@ -243,7 +243,8 @@ _ROOM = 1e-4
 class WildDrawing(Drawing):
     """A batch with what a frame's appearance adds."""
 
-    #: (B, H, W, 3) sRGB over black in the colours that all frames share.
+    #: (B, H, W, 3) sRGB over black in the colours that all frames share; (B, H, W, 0) where the
+    #: loss does not look at them.
     shared: torch.Tensor
     #: (B, H, W) uncertainty in units of the error; 1 where nothing is drawn.
     uncertainty: torch.Tensor
@@ -279,6 +280,11 @@ class WildRecipe(PlainRecipe[WildSettings]):
         """The plain fit's, and those of the appearance."""
         return {**super().parameters(), **self.tensors}
 
+    @property
+    def _compares_shared(self) -> bool:
+        """Whether the loss looks at the colours that all frames share."""
+        return self.settings.plain_dssim and self.settings.uncertainty != "nerf-w"
+
     def draw(self, batch: Batch) -> WildDrawing:
         """Draw the frames in their own and in the shared colours, with the uncertainty."""
         training, clip, model = self.material.training, self.clip, self.model
@@ -292,7 +298,7 @@ class WildRecipe(PlainRecipe[WildSettings]):
         channels = (
             model.lit(own, poses),
             before_drawing(look.uncertainty),
-            *([model.lit(shared, poses)] if self.settings.plain_dssim else []),
+            *([model.lit(shared, poses)] if self._compares_shared else []),
         )
         drawn, coverage = model.rasterized(
             torch.cat(channels, dim=-1),
@@ -332,7 +338,7 @@ class WildRecipe(PlainRecipe[WildSettings]):
             fit = gauss_loss(error.square().mean(dim=-1), sigma, least)
             return (fit * weights).mean() + settings.transient_weight * drawing.transient
         share = settings.dssim_weight
-        if settings.plain_dssim:
+        if self._compares_shared:
             loss = (1.0 - share) * photometric_loss(drawing.image, batch.images, weights, 0.0)
             loss = loss + share * photometric_loss(drawing.shared, batch.images, weights, 1.0)
         else:
