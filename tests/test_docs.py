@@ -73,6 +73,18 @@ def example_commands(page: Path) -> list[list[str]]:
     return [shlex.split(line, comments=True) for line in lines if line.startswith(programs)]
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_evaluations_on_a_page_do_not_share_a_folder(page: Path) -> None:
+    """Preset and settings are not in the name of a results folder, where other runs are refused."""
+    seen: dict[tuple[str, ...], list[str]] = {}
+    for words in example_commands(page):
+        if words[:2] != ["hwp-bench", "evaluate"] or {"-o", "--out", "--overwrite"} & set(words):
+            continue
+        named = zip(words, ["", *words], strict=False)
+        same = tuple(word for word, before in named if not {word, before} & {"--set", "--preset"})
+        assert seen.setdefault(same, words) == words, " ".join(words)
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_examples_are_accepted_by_their_commands(page: Path) -> None:
     for words in example_commands(page):
