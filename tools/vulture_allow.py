@@ -37,7 +37,8 @@ _.pose_rate  # `Recipe.rates` reads it by the tensor's name
 _.shadow_rate  # `Recipe.rates` reads it by the tensor's name
 _.texture_rate  # `Recipe.rates` reads it by the tensor's name
 _.transl_rate  # `Recipe.rates` reads it by the tensor's name
-WildGHandMethod  # the entry of wildghand/method.toml and of baselines/network-scratch
+NetworkMethod  # the entry of baselines/network-scratch
+WildGHandMethod  # the entry of wildghand/method.toml
 check_files  # `check_files` of wildghand/method.toml and of baselines/network-scratch
 modified  # part of the cache's key: a changed file is read again
 _.maxlong  # reprlib reads it

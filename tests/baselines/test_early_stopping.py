@@ -17,10 +17,12 @@ import torch
 from painted import SilentReport, TrainingMaker
 from scipy.ndimage import binary_erosion
 
+from hwp_bench.base.errors import BadMethod
 from hwp_bench.capture.splits import Split
 from hwp_bench.methods import MethodManifest, read_manifest
 from hwp_bench.methods.contract import Avatar, Budget, TrainingCapture
 from hwp_bench.methods.settings import settings_from
+from wildghand.fitting.method import NetworkMethod
 from wildghand.gaussians.training import load_frames
 from wildghand.model.settings import read_settings
 from wildghand.plain.loop import run_fit
@@ -126,6 +128,25 @@ def test_with_too_few_validation_frames_it_is_the_mean_of_the_last_steps(
     training.split = Split(training.id, last + 1, (0, 2), (first - 3, first), (first, last + 1))
     recipe, _, means = misled(training, RECIPES["plain"])
     assert all(torch.equal(value, means[40][name]) for name, value in recipe.snapshot().items())
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"prior": "shipped"},
+        {"mode": "default"},
+        {"prepass.enabled": True},
+        {"subject.enabled": True},
+        {"visibility.enabled": True},
+    ],
+    ids=str,
+)
+def test_the_network_alone_refuses_what_it_does_not_declare(changes: dict[str, Any]) -> None:
+    manifest = next(one for one in MANIFESTS if one.name == "network-scratch")
+    for preset in manifest.presets.values():
+        NetworkMethod({**preset, "device": "cpu"})
+    with pytest.raises(BadMethod, match="network-scratch"):
+        NetworkMethod({**manifest.presets["smoke"], "device": "cpu", **changes})
 
 
 @pytest.mark.parametrize("manifest", MANIFESTS, ids=lambda manifest: manifest.name)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from hwp_bench.base.errors import BadMethod
 from hwp_bench.hands.raster import draw_faces, mix_corners
 from hwp_bench.methods.contents import exposed_digest
 from hwp_bench.methods.contract import Budget, Report, TrainingCapture
@@ -71,6 +72,28 @@ class WildGHandMethod:
         """
         training = affordable(training, self.settings, budget)
         return run_fit(make_fit(training, self.settings, self.seed, self.device), budget, report)
+
+
+class NetworkMethod(WildGHandMethod):
+    """The network from random weights; refuses what its `method.toml` says that it does not use."""
+
+    def __init__(self, settings: Mapping[str, Any], seed: int = 0) -> None:
+        super().__init__(settings, seed)
+        made = self.settings
+        used = {
+            "prior": bool(made.prior),
+            "prepass.enabled": made.prepass.enabled,
+            "subject.enabled": made.subject.enabled,
+            "visibility.enabled": made.visibility.enabled,
+        }
+        for name in (name for name, value in used.items() if value):
+            raise BadMethod(
+                "is not a part of this method, which declares that it was trained on nothing and "
+                "chooses an earlier state alone by validation frames",
+                where="network-scratch",
+                field=name,
+                remedy="Take the method wildghand, and leave out of it what you do not want.",
+            )
 
 
 def affordable(

@@ -147,7 +147,8 @@ class WildGHandSettings:
 _BARE: Mapping[str, Any] = MappingProxyType(
     {
         "start_colors": False,
-        "schedule": {"validated": False},
+        # Nothing judges the frames, so that all of them can be fitted.
+        "schedule": {"validated": False, "frames_per_second": 0.0},
         "terms": {"surface": 0.0, "leave_hidden": False},
         **{
             name: {"enabled": False}
@@ -163,7 +164,6 @@ _PUBLISHED = merged(
             "epochs": 50,
             "texture_every": 1,
             "average_share": 0.0,
-            "frames_per_second": 0.0,
         },
         # Without PAO every pixel counts, as in Eq. 7 without W.
         "terms": {"dssim_weight": 0.0, "outside_weight": 1.0, "perceptual": 0.1},

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from hwp_bench.methods import find_method, read_manifest
 from hwp_bench.methods.contract import Budget, TrainingCapture
 from wildghand.fitting.method import affordable
 from wildghand.model.settings import read_settings
@@ -42,3 +43,10 @@ def test_frames_are_left_out_by_the_second(
     # The capture itself keeps its frames.
     assert len(training.train) == 32
     assert fewer.validation.tolist() == training.validation.tolist()
+
+
+def test_the_network_alone_takes_all_frames_as_other_baselines_do(
+    training: TrainingCapture,
+) -> None:
+    for preset in read_manifest(find_method("network-scratch")).presets.values():
+        assert affordable(training, read_settings(preset), Budget(seconds=1.0)) is training
