@@ -418,7 +418,7 @@ def sharpness_table(sources: Sequence[ResultsSource], captures: Mapping[str, Cap
     found, used = _score_again(sources, captures, "Sharpness", band_power)
     # (methods, captures, 3, B)
     power = np.array(found)
-    textured: np.ndarray = (power[0, :, 1] > _NOTHING).all(axis=1)
+    textured = np.all(power[0, :, 1] > _NOTHING, axis=1)
     if not textured.any():
         raise UsageError("the hands of these captures have no structure", field="--capture")
     drawn, true, both = np.moveaxis(power[:, textured], 2, 0)
@@ -432,7 +432,7 @@ def sharpness_table(sources: Sequence[ResultsSource], captures: Mapping[str, Cap
         for index, name in enumerate(BANDS):
             column = Column(name, 2, better, group)
             columns.append((column, [float(value) for value in values[:, index]]))
-    measured = {digest for digest, one in zip(used, textured.tolist(), strict=True) if one}
+    measured = {digest for digest, one in zip(used, list(textured), strict=True) if one}
     return table_of("By sharpness", columns, (*_SHARP_NOTES, *_left_out(sources, measured)))
 
 
