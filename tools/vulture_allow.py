@@ -38,8 +38,6 @@ _.shadow_rate  # `Recipe.rates` reads it by the tensor's name
 _.texture_rate  # `Recipe.rates` reads it by the tensor's name
 _.transl_rate  # `Recipe.rates` reads it by the tensor's name
 NetworkMethod  # the entry of baselines/network-scratch
-WildGHandMethod  # the entry of wildghand/method.toml
-check_files  # `check_files` of wildghand/method.toml and of baselines/network-scratch
 modified  # part of the cache's key: a changed file is read again
 _.maxlong  # reprlib reads it
 _.maxother  # reprlib reads it

@@ -218,7 +218,6 @@ def test_an_ablation_takes_the_networks_too(
 @pytest.mark.parametrize(
     ("settings", "problem"),
     [
-        ({"prior": "/none"}, "is not a prior"),
         ({"pao.regions": "sam:/none/sam.pth"}, "does not exist"),
         ({"pao.hand": "sam:VGG"}, "not a checkpoint of Segment Anything"),
         ({"perceptual": "vgg19:SAM"}, "torchvision's VGG-19"),
