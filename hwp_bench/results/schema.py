@@ -407,7 +407,7 @@ def shown_files(results: Results) -> list[str]:
     return sorted({capture.exposed for capture in results.captures if capture.exposed})
 
 
-# As `hwp_bench.methods.manifest.resolve_files` writes a file or folder of a person.
+# As `hwp_bench.methods.manifest.find_setting_files` writes a file or folder of a person.
 _FILE = re.compile(r"\A([a-z][a-z0-9-]*):/.*\Z", re.DOTALL)
 
 
