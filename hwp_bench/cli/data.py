@@ -167,18 +167,17 @@ def _capture_and_split(
 def _unscorable(capture: Capture, split: Split) -> list[Finding]:
     """The frames that a test scores and whose mask leaves nothing to score."""
     from hwp_bench.capture.check import Finding
-    from hwp_bench.metrics.pixels import can_be_scored
+    from hwp_bench.metrics.pixels import unscorable
 
     clip, found = capture.free_view, []
     scored: list[tuple[Capture, Iterable[int], str]] = [(capture, split.test, "test")]
     if clip is not None:
         scored.append((clip, range(len(clip)), "free-view"))
     for part, frames, name in scored:
-        for frame in frames:
-            if not can_be_scored(*part.scoring_mask(frame)):
-                problem = f"the mask of {name} frame {frame} leaves no pixel to score"
-                remedy = "These frames must show the hand."
-                found.append(Finding("error", str(part.root), "masks", problem, remedy))
+        for frame in unscorable(frames, part.scoring_mask):
+            problem = f"the mask of {name} frame {frame} leaves no pixel to score"
+            remedy = "These frames must show the hand."
+            found.append(Finding("error", str(part.root), "masks", problem, remedy))
     return found
 
 

@@ -44,7 +44,7 @@ from hwp_bench.capture.schema import (
 from hwp_bench.capture.splits import Split, split_for
 from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.request import write_request
-from hwp_bench.metrics.pixels import can_be_scored
+from hwp_bench.metrics.pixels import unscorable
 
 #: Version of the commitments.
 SCHEME = "hwp-commitment/1"
@@ -156,10 +156,9 @@ def publish(
 def _refuse_unscorable(capture: Capture, frames: Iterable[int]) -> None:
     """Refuse, before the commitment, a capture that no evaluation would take after it."""
     refuse_changed(capture, ("frames", "masks", *["true_masks"] * capture.has_true_masks))
-    for frame in frames:
-        if not can_be_scored(*capture.scoring_mask(frame)):
-            problem = f"the mask of frame {frame} leaves no pixel to score"
-            raise BadCapture(problem, where=capture.root, field="masks")
+    for frame in unscorable(frames, capture.scoring_mask):
+        problem = f"the mask of frame {frame} leaves no pixel to score"
+        raise BadCapture(problem, where=capture.root, field="masks")
 
 
 def open_captures(

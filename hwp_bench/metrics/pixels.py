@@ -18,6 +18,7 @@ stays nearly the same.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -129,6 +130,13 @@ def scored_pixels(mask: np.ndarray, *, erosion: int, coverage: bool = False) -> 
 def can_be_scored(mask: np.ndarray, coverage: bool) -> bool:
     """Whether a mask leaves protocol hwp-v1 a pixel to score; see `scored_pixels`."""
     return bool(scored_pixels(mask, erosion=HWP_V1.mask_erosion, coverage=coverage).any())
+
+
+def unscorable(
+    frames: Iterable[int], scoring_mask: Callable[[int], tuple[np.ndarray, bool]]
+) -> Iterator[int]:
+    """Yield the frames whose masks, as `Capture.scoring_mask` reads them, cannot be scored."""
+    return (frame for frame in frames if not can_be_scored(*scoring_mask(frame)))
 
 
 def bounding_box(region: np.ndarray) -> Box:
