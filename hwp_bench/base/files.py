@@ -156,6 +156,15 @@ def refuse_existing(
         raise _exists(path, flag)
 
 
+def refuse_existing_file(
+    path: str | os.PathLike[str], *, overwrite: bool, field: str | None = None
+) -> None:
+    """Refuse to replace a file of a person who has not given --overwrite; `field` names it."""
+    if Path(path).exists() and not overwrite:
+        remedy = "Choose another name, or give --overwrite."
+        raise UsageError("exists", where=path, field=field, remedy=remedy)
+
+
 def refuse_other(path: str | os.PathLike[str], what: str, is_one: Callable[[Path], bool]) -> None:
     """Refuse to put a folder in the place of a file, or of a folder with something else.
 

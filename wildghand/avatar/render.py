@@ -15,7 +15,7 @@ import torch
 from hwp_bench.base.console import track
 from hwp_bench.base.drawing import labelled, sheet
 from hwp_bench.base.errors import UsageError
-from hwp_bench.base.files import atomic_folder, check_places, refuse_other
+from hwp_bench.base.files import atomic_folder, check_places, refuse_existing_file, refuse_other
 from hwp_bench.base.images import as_uint8, check_encoder, write_image, write_movie
 from hwp_bench.capture import Capture
 from wildghand.avatar.avatar import WildGHandAvatar
@@ -39,13 +39,7 @@ def render_clip(
     check_places({"out": out, "video": video}, {"poses": capture.root}, replaces=overwrite)
     sides = shown_sides(avatar, capture)
     if video is not None:
-        if video.exists() and not overwrite:
-            raise UsageError(
-                "exists",
-                where=video,
-                field="--video",
-                remedy="Choose another name, or give --overwrite.",
-            )
+        refuse_existing_file(video, overwrite=overwrite, field="--video")
         check_encoder()
     seconds, images = 0.0, []
     with atomic_folder(out, overwrite=overwrite, flag="--overwrite") as folder:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hwp_bench.base.errors import UsageError
-from hwp_bench.base.files import check_places
+from hwp_bench.base.files import check_places, refuse_existing_file
 from hwp_bench.cli.options import add_json, print_json
 from wildghand.cli.options import (
     add_address,
@@ -228,8 +228,7 @@ def _do_stage(args: argparse.Namespace) -> int:
     check_places({"--out": args.out}, {"AVATAR": args.avatar, "--poses": args.poses})
     if args.out.suffix.lower() not in (".png", ".jpg"):
         raise UsageError("has another ending than .png or .jpg", where=args.out, field="--out")
-    if args.out.exists() and not args.overwrite:
-        raise UsageError("exists", where=args.out, remedy="Give --overwrite to replace it.")
+    refuse_existing_file(args.out, overwrite=args.overwrite)
     poses = args.poses or capture_of(args.avatar)
     if poses is None:
         raise UsageError("is missing", field="--poses", remedy="Name the capture that was fitted.")

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from hwp_bench.base.errors import UsageError
-from hwp_bench.base.files import atomic_write
+from hwp_bench.base.files import atomic_write, refuse_existing_file
 from hwp_bench.base.packages import __version__
 from hwp_bench.capture import Capture
 from hwp_bench.hands import load_template
@@ -94,8 +94,7 @@ def check_target(path: Path, settings: ExportSettings, *, overwrite: bool) -> No
         raise UsageError(f"is {settings.harmonics}", field="--harmonics", remedy="Use 0 to 3.")
     if settings.texture is not None and not 64 <= settings.texture <= 4096:
         raise UsageError(f"is {settings.texture}", field="--texture", remedy="Use 64 to 4096.")
-    if path.exists() and not overwrite:
-        raise UsageError("exists", where=path, remedy="Give --overwrite to replace it.")
+    refuse_existing_file(path, overwrite=overwrite)
 
 
 def export(

@@ -17,7 +17,7 @@ import torch
 
 from hwp_bench.base.arrays import evenly
 from hwp_bench.base.errors import UsageError
-from hwp_bench.base.files import atomic_write
+from hwp_bench.base.files import atomic_write, refuse_existing_file
 from hwp_bench.capture import Capture
 from hwp_bench.hands import anatomical_limits, load_template, pose_from_joint_angles
 from hwp_bench.methods.contract import Camera, HandPose
@@ -294,8 +294,7 @@ def write_page(
         HwpError: the place cannot be written.
     """
     settings = settings or PageSettings()
-    if out.exists() and not overwrite:
-        raise UsageError("exists", where=out, remedy="Choose another name or give --overwrite.")
+    refuse_existing_file(out, overwrite=overwrite)
     if isinstance(avatar, Path):
         avatar = load_avatar(avatar, hand=hand)
     samples = sample_poses(avatar, capture, settings)
