@@ -100,7 +100,6 @@ def export_transforms(
     out, info, cameras = place(out, "out"), capture.info, capture.cameras
     check_places({"out": out}, {"capture": capture.root}, replaces=overwrite)
     refuse_other(out, "an exported scene", lambda folder: (folder / TRANSFORMS).is_file())
-    refuse_existing(out, overwrite=overwrite)
     if cameras.Ks[:, 0, 1].any():
         raise BadInput("has skew, for which transforms.json has no field", where=capture.root)
     poses = _UPRIGHT @ np.linalg.inv(cameras.viewmats) @ _FLIP

@@ -5,7 +5,7 @@ By novelty of the pixels, by what is drawn outside, and by how sharp it is.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -283,7 +283,7 @@ def _pooled(
     return totals, used
 
 
-def _left_out(sources: Sequence[ResultsSource], used: Set[str]) -> list[str]:
+def _left_out(sources: Sequence[ResultsSource], used: Collection[str]) -> list[str]:
     """Name the captures of the results that a table is not of, in a note."""
     every = {item.digest: item.id for source in sources for item in source.results.captures}
     lost = [name for digest, name in every.items() if digest not in used]
@@ -338,7 +338,7 @@ def outline_table(sources: Sequence[ResultsSource], captures: Mapping[str, Captu
         (Column("With the outside [dB]", 2, True), [mean.psnr_with_outside for mean in means]),
         (Column("If spread [dB]", 2), [mean.psnr_spread for mean in means]),
     ]
-    return table_of("By outline", columns, (*_NOTES, *_left_out(sources, set(used))))
+    return table_of("By outline", columns, (*_NOTES, *_left_out(sources, used)))
 
 
 #: Standard deviations of the blurs whose differences are the bands, px.
@@ -432,7 +432,7 @@ def sharpness_table(sources: Sequence[ResultsSource], captures: Mapping[str, Cap
         for index, name in enumerate(BANDS):
             column = Column(name, 2, better, group)
             columns.append((column, [float(value) for value in values[:, index]]))
-    measured = {digest for digest, one in zip(used, list(textured), strict=True) if one}
+    measured = [used[place] for place in np.flatnonzero(textured)]
     return table_of("By sharpness", columns, (*_SHARP_NOTES, *_left_out(sources, measured)))
 
 

@@ -270,15 +270,13 @@ def import_options(job: VideoJob) -> VideoImport:
             where=job.video,
             remedy="Record some seconds in which the whole hand is visible and turns.",
         )
-    frames = FrameRange(stride=step)
+    choices = replace(choices, frames=FrameRange(stride=step))
     if few:
         notice(f"The {few[0]} hand is in {seen[few[0]]} of {of} only and is left out.")
-        return replace(
-            choices, frames=frames, side=next(side for side in seen if side not in few) or "auto"
-        )
+        return replace(choices, side=next(side for side in seen if side not in few) or "auto")
     together = int(np.all([hand.detected[::step] for hand in hands.values()], axis=0).sum())
     if together >= FEWEST:
-        return replace(choices, frames=frames)
+        return choices
     # A fit takes the frames that show all of its hands.
     if job.options.side == "both":
         raise BadInput(
@@ -292,7 +290,7 @@ def import_options(job: VideoJob) -> VideoImport:
         f"Both hands are in {together} of {of} only; the {other} hand is left out (--side {other} "
         "takes it instead)."
     )
-    return replace(choices, frames=frames, side=side or "auto")
+    return replace(choices, side=side or "auto")
 
 
 class FitStage(Stage):
