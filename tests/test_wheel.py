@@ -107,4 +107,4 @@ def test_the_shipped_baseline_can_be_loaded_from_it(programs: Path, tmp_path: Pa
         "    print(load_entry(manifest.root, manifest.entry.python).__name__)\n"
     )
     names = run(programs / "python", "-c", code, cwd=tmp_path).split()
-    assert names == ["PlainMethod", "PlainMethod", "WildGHandMethod", "WildGHandMethod"]
+    assert names == ["PlainMethod", "PlainMethod", "NetworkMethod", "WildGHandMethod"]

@@ -136,10 +136,13 @@ def _plan(args: argparse.Namespace) -> int:
 
 def _render(args: argparse.Namespace) -> int:
     """Render captures and print their folders."""
+    from hwp_bench.base.records import whole_seed
     from hwp_bench.capture.folder import refuse_taken
     from hwp_bench.run.engine.options import engine_for, needs_of
     from hwp_bench.sim.produce.capture import RenderRequest, ensure_suite, workers_each
 
+    if args.seed is not None:
+        whole_seed(args.seed, "--seed")
     if (args.suite is None) == (args.scene is None):
         raise UsageError("give a scene, all, or a suite with --suite")
     changes = (

@@ -104,7 +104,7 @@ def test_an_unknown_perturbation_is_named_with_its_file(make_capture: CaptureMak
 def test_a_seed_below_zero_is_refused_by_the_simulator(tmp_path: Path, capsys) -> None:
     out = tmp_path / "out"
     assert main(["sim", "render", "capture0", "-o", str(out), "--seed", "-1"]) == 2
-    assert "--seed: is -1" in capsys.readouterr().err
+    assert "--seed: -1 is not from 0 to" in capsys.readouterr().err
     assert not out.exists()
 
 
