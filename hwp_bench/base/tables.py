@@ -333,7 +333,8 @@ class _Drawing:
         """What `rich` prints: the caption, the blocks, and the notes under them."""
         from rich.text import Text
 
-        yield Text(self.fit(self.table.caption), "italic")
+        if self.table.caption:
+            yield Text(self.fit(self.table.caption), "italic")
         for number, columns in enumerate(self.blocks()):
             yield from [""] if number else []
             yield from self._block(columns)

@@ -204,7 +204,7 @@ def test_a_digest_of_the_other_hand_is_named(
     file.write_text(file.read_text().replace(*digests))
     assert main(["data", "check", str(capture.root)]) == 1
     said = capsys.readouterr().out
-    assert "NOT SOUND" in said
+    assert f"{capture.root}: NOT SOUND\n" in said
     assert f"hand_model.digest: is the digest of the {other} hand of anny-1" in said
     first = "right" if hands == "both" else hands
     with pytest.raises(
