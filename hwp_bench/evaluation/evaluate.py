@@ -345,10 +345,10 @@ def check_suite(
         _check_predictions(manifest, items)
     if is_ready(settings.suite):
         return False
-    with exclusive(out):
-        pass
     if rehearse:
         make_plan(manifest, (), with_setting_files(manifest, settings), {}).rehearse()
+    with exclusive(out):
+        pass
     return rehearse
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import importlib.util
 import itertools
 import os
@@ -176,8 +175,6 @@ class ManifestFields:
     #: What a person sets this way needs no `--expose`. A preset exposes nothing: it comes with
     #: the method.
     files: dict[_SettingName, list[_KindName]] = field(default_factory=dict)
-    #: `module:callable` that checks such files before a method that ships is run.
-    check_files: _PythonEntry | None = None
     #: Settings by preset.
     presets: dict[str, dict[str, Any]] = field(default_factory=dict)
     #: Components and alternatives for ablations, by name, in the order of the file.
@@ -455,16 +452,12 @@ def check_settings(
 ) -> None:
     """Refuse settings that cannot work, before anything is rendered or run.
 
-    Names are checked, and files that settings name must be there. What a method that ships has to
-    say of those files (`check_files` in its `method.toml`) is asked too. Of another method
-    nothing is imported here: its code runs in the sandbox only.
+    Names are checked, and files that settings name must be there. What is in them is the method's
+    own to check where it is made: its code runs in the sandbox only.
     """
     manifest.check_setting_names(values, field)
     manifest.doubt_setting_names(values, field)
-    resolved, files = find_setting_files(manifest, values)
-    if files and manifest.check_files and ships(manifest.root):
-        module, _, function = manifest.check_files.partition(":")
-        getattr(importlib.import_module(module), function)(resolved)
+    find_setting_files(manifest, values)
 
 
 def ships(root: Path) -> bool:

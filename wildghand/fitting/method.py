@@ -46,6 +46,7 @@ class WildGHandMethod:
 
     Raises:
         BadMethod: a setting is unknown or out of range.
+        BadInput: a file that settings name is missing or unusable.
         UsageError: a perceptual network is named whose term has no weight.
         MissingDependency: CUDA was asked for and is not there.
     """
@@ -53,6 +54,7 @@ class WildGHandMethod:
     def __init__(self, settings: Mapping[str, Any], seed: int = 0) -> None:
         self.settings = read_settings(settings)
         refuse_idle_network(self.settings)
+        check_files(self.settings)
         self.seed = seed
         self.device = ready_fit(self.settings.device)
 
@@ -120,9 +122,8 @@ def digest_of_named_files(settings: WildGHandSettings) -> str:
     return exposed_digest(paths)
 
 
-def check_files(values: Mapping[str, Any]) -> None:
+def check_files(settings: WildGHandSettings) -> None:
     """Check the files that settings name: a prior's place, and networks with their tensors."""
-    settings = read_settings(values)
     if settings.prior not in ("", SHIPPED):
         find_prior(settings.prior)
     for path in {source_path(settings.pao.regions), source_path(settings.pao.hand)} - {None}:

@@ -137,7 +137,7 @@ def make_avatar(
     job = VideoJob(Path(video), folder, options, world, watch, glimpse)
     chosen = read_settings(options.method_settings())
     refuse_idle_network(chosen)
-    check_files(options.method_settings())
+    check_files(chosen)
     world.shard(chosen.schedule.batch)
     if world.is_main:
         _check_folder(job, overwrite=overwrite)

@@ -336,7 +336,6 @@ training = "none"
 name = "listed"
 settings = ["steps", "net.regions"]
 files = { "net.regions" = ["sam"] }
-check_files = "no_such_module:nothing"
 [entry]
 python = "a:b"
 [presets.default]
@@ -384,13 +383,6 @@ def test_a_file_that_is_not_there_is_refused(manifest: MethodManifest, tmp_path:
         check_settings(manifest, {"net.regions": "sam:"})
     with pytest.raises(BadMethod, match=r"--set: 'net\.region' is not"):
         check_settings(manifest, {"net.region": "sam:x"}, "--set")
-
-
-def test_nothing_of_a_method_that_does_not_ship_is_imported(
-    manifest: MethodManifest, tmp_path: Path
-) -> None:
-    (tmp_path / "weights").mkdir()
-    check_settings(manifest, {"net.regions": f"sam:{tmp_path / 'weights'}"})
 
 
 def test_a_rule_for_a_setting_that_is_not_there_is_refused(tmp_path: Path) -> None:

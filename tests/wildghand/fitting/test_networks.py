@@ -31,7 +31,7 @@ from wildghand.fitting import fit_capture
 from wildghand.fitting.components import make_fit
 from wildghand.fitting.fit import StepBatch
 from wildghand.fitting.judging import hand_masks, hand_roots
-from wildghand.fitting.method import WildGHandMethod, check_files, digest_of_named_files
+from wildghand.fitting.method import WildGHandMethod, digest_of_named_files
 from wildghand.fitting.session import digest_of_request
 from wildghand.from_video import VideoFit
 from wildghand.from_video.run import VideoJob
@@ -220,23 +220,28 @@ def test_an_ablation_takes_the_networks_too(
     [
         ({"pao.regions": "sam:/none/sam.pth"}, "does not exist"),
         ({"pao.hand": "sam:VGG"}, "not a checkpoint of Segment Anything"),
-        ({"perceptual": "vgg19:SAM"}, "torchvision's VGG-19"),
-        ({"perceptual": "vgg19:TEXT"}, "cannot be read"),
+        ({"perceptual": "vgg19:SAM", "terms.perceptual": 0.1}, "torchvision's VGG-19"),
+        ({"perceptual": "vgg19:TEXT", "terms.perceptual": 0.1}, "cannot be read"),
         ({"pao.regions": "slic"}, "superpixels or sam:PATH"),
         ({"pao.hand": "mask"}, "estimated or graph-cut or sam:PATH"),
         ({"perceptual": "vgg16:x"}, "filter-bank or vgg19:PATH"),
+        ({"prior": "NONE"}, "NONE: prior: is not a prior"),
+        ({"prior": "/none"}, "/none: prior: is not a prior"),
     ],
     ids=str,
 )
 def test_what_cannot_work_is_refused_before_a_suite_is_rendered(
-    settings: dict[str, str], problem: str, folder: Path, tmp_path: Path, capsys: Any
+    settings: dict[str, Any], problem: str, folder: Path, tmp_path: Path, capsys: Any
 ) -> None:
     (tmp_path / "text").write_text("no weights")
     places = {"VGG": folder / "vgg19.pth", "SAM": folder / "sam.pth", "TEXT": tmp_path / "text"}
     for word, place in places.items():
-        settings = {name: value.replace(word, str(place)) for name, value in settings.items()}
+        settings = {
+            name: value.replace(word, str(place)) if isinstance(value, str) else value
+            for name, value in settings.items()
+        }
     with pytest.raises((BadInput, UsageError), match=problem):
-        check_files(settings)
+        WildGHandMethod({"device": "cpu", **settings})
     if "PATH" not in problem:
         out = tmp_path / "runs"
         for command in ("evaluate", "ablate"):
