@@ -45,7 +45,8 @@ class HwpError(Exception):
         self.field = field
         self.remedy = remedy
         head = ": ".join(part for part in (self.where, self.field, problem) if part)
-        super().__init__(f"{head}. {remedy}" if remedy else head)
+        # A problem that another program has written may end with one.
+        super().__init__(f"{head.removesuffix('.')}. {remedy}" if remedy else head)
 
 
 def reason_of(error: OSError) -> str:

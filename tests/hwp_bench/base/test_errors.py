@@ -60,3 +60,8 @@ def test_records_with_control_characters_are_refused(value: dict) -> None:
 def test_records_keep_any_ordinary_text() -> None:
     value = {"title": "<b>Hände</b>\n手", "scores": {"psnr": 1.0}}
     assert parse_record(_Named, value, where="file.json").title == value["title"]
+
+
+def test_a_problem_that_ends_with_a_full_stop_has_one_before_the_remedy() -> None:
+    assert str(HwpError("It broke.", remedy="Mend it.")) == "It broke. Mend it."
+    assert str(HwpError("it broke", remedy="Mend it.")) == "it broke. Mend it."
