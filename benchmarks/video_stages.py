@@ -2,8 +2,9 @@
 
 Run from the repository, on a machine with nothing else to do:
 `python -m benchmarks.video_stages hand.mp4` makes the avatar both ways, each in a new folder and a
-process of its own, as a person would. What it finds takes the place of the same video's lines in
-`video_stages.jsonl`; `hwp-bench dev docs-results` writes the table of docs/video.md from them.
+process of its own, as a person would. What it finds takes the place of the same video's and
+machine's lines in `video_stages.jsonl`; `hwp-bench dev docs-results` writes the table of
+docs/video.md from them.
 """
 
 from __future__ import annotations
@@ -45,12 +46,16 @@ def measure(video: Path, *, quick: bool) -> dict[str, Any]:
 
 
 def keep(found: list[dict[str, Any]], log: Path = LOG) -> None:
-    """Write what was found, in place of older lines of the same video and way."""
+    """Write what was found, in place of older lines of the same video, way and machine."""
     lines = log.read_text("utf-8").splitlines() if log.is_file() else []
-    new = {(one["video"], one["quick"]) for one in found}
-    old = [one for one in map(json.loads, lines) if (one["video"], one["quick"]) not in new]
+    new = set(map(_call, found))
+    old = [one for one in map(json.loads, lines) if _call(one) not in new]
     text = "".join(json.dumps(one) + "\n" for one in (*old, *found))
     atomic_write(log, text.encode(), overwrite=True)
+
+
+def _call(one: dict[str, Any]) -> tuple[str, bool, str]:
+    return one["video"], one["quick"], one["machine"]
 
 
 def main() -> None:

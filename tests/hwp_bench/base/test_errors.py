@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from hwp_bench.base.console import notice
-from hwp_bench.base.errors import BadResult, bounded, has_odd_characters, shown
+from hwp_bench.base.errors import BadResult, HwpError, bounded, has_odd_characters, shown
 from hwp_bench.base.records import parse_record
 
 

@@ -387,3 +387,13 @@ def test_a_folder_of_methods_and_seeds_is_added_in_one_call(
     assert main(words) == 1
     assert "capture7" in capsys.readouterr().err
     assert len(list(entries.glob("*.json"))) == len(made)
+
+
+def test_runs_of_a_video_on_other_machines_are_kept(tmp_path: Path) -> None:
+    log = tmp_path / "stages.jsonl"
+    first, later = (video_stages(seconds, quick=False) for seconds in (7.0, 5.4))
+    keep([first], log)
+    keep([{**first, "machine": "another"}], log)
+    keep([later], log)
+    kept = [json.loads(line) for line in log.read_text("utf-8").splitlines()]
+    assert kept == [{**first, "machine": "another"}, later]
