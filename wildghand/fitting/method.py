@@ -52,9 +52,7 @@ class WildGHandMethod:
     """
 
     def __init__(self, settings: Mapping[str, Any], seed: int = 0) -> None:
-        self.settings = read_settings(settings)
-        refuse_idle_network(self.settings)
-        check_files(self.settings)
+        self.settings = read_usable(settings)
         self.seed = seed
         self.device = ready_fit(self.settings.device)
 
@@ -122,8 +120,10 @@ def digest_of_named_files(settings: WildGHandSettings) -> str:
     return exposed_digest(paths)
 
 
-def check_files(settings: WildGHandSettings) -> None:
-    """Check the files that settings name: a prior's place, and networks with their tensors."""
+def read_usable(values: Mapping[str, Any]) -> WildGHandSettings:
+    """Read settings; check the files that they name: a prior's place, networks' tensors."""
+    settings = read_settings(values)
+    refuse_idle_network(settings)
     if settings.prior not in ("", SHIPPED):
         find_prior(settings.prior)
     for path in {source_path(settings.pao.regions), source_path(settings.pao.hand)} - {None}:
@@ -131,6 +131,7 @@ def check_files(settings: WildGHandSettings) -> None:
     perceptual = source_path(settings.perceptual)
     if perceptual is not None:
         Vgg19(perceptual)  # as light as a check: its tensors stay on the disk
+    return settings
 
 
 def ready_fit(name: str) -> torch.device:

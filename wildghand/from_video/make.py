@@ -24,8 +24,7 @@ from hwp_bench.methods.contract import Budget
 from hwp_bench.tracking.networks import LiteRtNetworks, load_models
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import DESCRIPTION, load_avatar
-from wildghand.fitting.method import check_files
-from wildghand.fitting.objective import refuse_idle_network
+from wildghand.fitting.method import read_usable
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
 from wildghand.fitting.session import Watch, fit_capture
 from wildghand.fitting.tensorboard import logging_fit
@@ -40,7 +39,6 @@ from wildghand.from_video.run import (
 )
 from wildghand.from_video.stages import STAGES
 from wildghand.from_video.verdict import Verdict, read_verdict
-from wildghand.model.settings import read_settings
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,9 +133,7 @@ def make_avatar(
     options = options or VideoFit()
     folder = default_folder(Path(video)) if out is None else Path(out)
     job = VideoJob(Path(video), folder, options, world, watch, glimpse)
-    chosen = read_settings(options.method_settings())
-    refuse_idle_network(chosen)
-    check_files(chosen)
+    chosen = read_usable(options.method_settings())
     world.shard(chosen.schedule.batch)
     if world.is_main:
         _check_folder(job, overwrite=overwrite)
