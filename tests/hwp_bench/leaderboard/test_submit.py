@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -247,6 +248,16 @@ def test_the_entry_s_own_results_are_rescored(made, tmp_path: Path, capsys) -> N
     assert "rescored, differs (2 frames)" in capsys.readouterr().out
     levels = {item.name: (item.level, item.badge) for item in read_entries(tmp_path / "entries")}
     assert levels[make_entry(wrong).name] == ("self-reported", "differs")
+
+
+@pytest.mark.parametrize("gone", ["capture", "predictions"])
+def test_what_cannot_be_scored_again_makes_no_check(made, gone: str) -> None:
+    file, capture = made
+    entry = make_entry(read_results(file))
+    if gone == "predictions":
+        shutil.rmtree(file.parent / "captures" / "tiny" / "predictions")
+    with pytest.raises(BadResult, match="cannot be scored again here"):
+        confirm(entry, file, [] if gone == "capture" else [capture], by="us")
 
 
 def test_a_second_run_reproduces_within_the_tolerance(made) -> None:
