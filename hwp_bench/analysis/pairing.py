@@ -65,6 +65,9 @@ def group_runs(results: Sequence[Results]) -> list[MethodRuns]:
     for result in results:
         seeds = groups.setdefault(same_but_seed(result), {})
         if result.seed in seeds:
+            between = f"two results of {result.method.title}"
+            refuse_other_scoring(between, seeds[result.seed], result)
+            _same_captures(between, seeds[result.seed], result)
             raise UsageError(
                 f"two results are of {result.method.title} with seed {result.seed} and the same "
                 "settings",

@@ -71,8 +71,8 @@ def read_sources(
     first: dict[str, ResultsSource] = {}
     for source in sources:
         result = source.results
-        data = sorted((capture.id, capture.digest) for capture in result.captures)
-        kept = first.setdefault(sha256_json([same_but_seed(result), result.seed, data]), source)
+        known = sha256_json([same_but_seed(result), result.seed, data_key(result)])
+        kept = first.setdefault(known, source)
         if kept is not source:
             notice(f"left out: {source.folder} repeats {kept.folder} (same method, settings, seed)")
     return list(first.values())

@@ -10,10 +10,18 @@ import pytest
 from made_results import made_results
 from small_captures import results_example
 
+from hwp_bench.analysis.pairing import group_runs
+from hwp_bench.base.errors import UsageError
 from hwp_bench.base.tables import Column, Table
 from hwp_bench.cli.main import main
 from hwp_bench.report.requested_table import TableRequest, make_table
-from hwp_bench.report.sources import DataGroup, ResultsSource, data_groups, stacked
+from hwp_bench.report.sources import (
+    DataGroup,
+    ResultsSource,
+    data_groups,
+    read_sources,
+    stacked,
+)
 from hwp_bench.report.study_tables import cost_table, on_front
 from hwp_bench.results import write_results
 
@@ -82,6 +90,19 @@ def test_a_best_is_marked_within_the_same_data(mixed) -> None:
 def test_a_run_that_is_given_twice_stops_no_table(mixed) -> None:
     notes = make_table(TableRequest([mixed[0], mixed[0], mixed[2]])).notes
     assert notes[0].startswith("Nobody is named as the winner: two results are of Plain")
+
+
+def test_the_same_run_on_another_split_is_no_repeat(tmp_path: Path) -> None:
+    base = made_results("mine", level(20.0))
+    other = replace(base, captures=[replace(c, split_digest="e") for c in base.captures])
+    paths = [
+        write_results(tmp_path / name / "results.json", row).parent
+        for name, row in (("a", base), ("b", other), ("again", base))
+    ]
+    kept = read_sources(paths, repeats=False)
+    assert [source.folder for source in kept] == paths[:2]
+    with pytest.raises(UsageError, match="different splits under the name"):
+        group_runs([base, other])
 
 
 def test_captures_of_two_versions_of_an_importer_are_named(tmp_path: Path, capsys) -> None:
