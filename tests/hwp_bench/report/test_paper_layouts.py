@@ -94,6 +94,18 @@ def test_layouts_are_as_they_were_looked_at(number: int, folders, ablation) -> N
         assert text == file.read_text(encoding="utf-8")
 
 
+def test_a_metric_that_one_seed_lacks_makes_no_column(folders) -> None:
+    file = folders[1] / "results.json"
+    whole = read_results(file)
+    captures = [
+        replace(one, frames=[replace(f, scores={**f.scores, "flip": 0.1}) for f in one.frames])
+        for one in whole.captures
+    ]
+    before = format_table(make_table(TableRequest(folders, paper=3)), "md")
+    write_results(file, replace(whole, captures=captures))
+    assert format_table(make_table(TableRequest(folders, paper=3)), "md") == before
+
+
 def test_published_rows_are_marked_and_never_ranked(folders) -> None:
     table = make_table(TableRequest(folders, published=True))
     published = [i for i, row in enumerate(table.rows) if "published, other data" in str(row[0])]
