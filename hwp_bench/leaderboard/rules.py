@@ -28,9 +28,9 @@ from hwp_bench.evaluation.verify import Discrepancy, copy_differences, digest_di
 from hwp_bench.leaderboard.entries import LEVELS, Check, Contest, Entry, make_entry, read_entries
 from hwp_bench.leaderboard.suite_data import CaptureData, known_data, on_current_data, suite_origins
 from hwp_bench.methods.manifest import MethodManifest, shipped_methods
-from hwp_bench.metrics import HWP_V1, PROTOCOLS, metric_names, penalty
+from hwp_bench.metrics import HWP_V1, METRICS, PROTOCOLS, metric_names
 from hwp_bench.metrics.score import aggregate
-from hwp_bench.results import Results
+from hwp_bench.results import Results, read_results
 from hwp_bench.results.schema import (
     MAX_BYTES,
     UNDECLARED,
@@ -558,7 +558,7 @@ def _check_data(entry: Entry, capture: CaptureResult, data: CaptureData | None) 
 
 
 def _check_frames(entry: Entry, capture: CaptureResult) -> None:
-    penalties = penalty()
+    penalties = {facts.name: facts.penalty for facts in METRICS}
     scored = 0
     metrics = set(entry.results.metrics)
     if capture.free_view is not None and not capture.free_view.frames:
@@ -573,7 +573,7 @@ def _check_frames(entry: Entry, capture: CaptureResult) -> None:
         scored += frame.failure is None
         if frame.failure is None:
             continue
-        if any(frame.scores[name] != value for name, value in penalties.items()):
+        if any(value != penalties.get(name, value) for name, value in frame.scores.items()):
             raise _wrong(entry, place, "failed, and has other scores than the penalties")
     if capture.failure is not None and scored:
         raise _wrong(entry, f"{capture.id}.failure", f"says that all failed; {scored} have scores")
@@ -616,6 +616,7 @@ def _wrong(entry: Entry, field: str, problem: str) -> BadResult:
 
 def check_source(file: Path) -> None:
     """Refuse a result file that was changed by hand, before an entry is made of it."""
+    read_results(file)  # another file has no digests to compare
     value = read_json(file, max_bytes=MAX_BYTES)
     found: list[Discrepancy] = [
         *copy_differences(file.parent, value, RESULT),

@@ -170,6 +170,14 @@ def test_one_run_contests(folder: Path, tmp_path: Path, capsys) -> None:
     assert "has 2 results" in capsys.readouterr().err
 
 
+def test_a_file_that_is_no_result_is_refused(folder: Path, tmp_path: Path, capsys) -> None:
+    for text in ("[]", "{}", '{"schema": "hwp-entry/1"}'):
+        file = tmp_path / "other.json"
+        file.write_text(text)
+        assert call(folder, file) == 1
+        assert str(file) in capsys.readouterr().err
+
+
 def test_unsound_runs_and_edited_files_are_refused(folder: Path, tmp_path: Path) -> None:
     entry = own(folder)
     unsound = replace(run(20.0), captures=[replace(c, key="k") for c in run(20.0).captures])

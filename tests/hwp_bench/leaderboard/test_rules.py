@@ -42,6 +42,7 @@ from hwp_bench.leaderboard.suite_data import (
     rendered_data,
     write_suite_data,
 )
+from hwp_bench.metrics import penalty
 from hwp_bench.results import Results, write_results
 from hwp_bench.sim.produce.capture import RENDERER
 
@@ -159,6 +160,20 @@ def test_keys_that_fit_do_not_hide_other_data(tmp_path: Path, capsys) -> None:
     forged(tmp_path, lambda v: v["captures"][1].update(digest="0" * 64), keys=True)
     assert main(["leaderboard", "check", "--entries", str(tmp_path)]) == 1
     assert "capture4.digest: is not the data of the suite" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("flip", "status"), [(1.0, 0), (0.0, 1)])
+def test_a_failed_frame_has_the_penalty_of_every_metric(
+    tmp_path: Path, capsys, flip: float, status: int
+) -> None:
+    def change(value: dict) -> None:
+        for frame in (frame for c in value["captures"] for frame in c["frames"]):
+            frame["scores"]["flip"] = 0.5
+        _frame(value).update(failure="crashed", scores={**penalty(), "flip": flip})
+
+    forged(tmp_path, change, keys=True)
+    assert main(["leaderboard", "check", "--entries", str(tmp_path)]) == status
+    assert ("other scores than the penalties" in capsys.readouterr().err) == bool(status)
 
 
 def test_a_check_says_what_its_numbers_say(tmp_path: Path, capsys) -> None:
