@@ -286,11 +286,11 @@ def _report_outcome(out: Path, results: Results) -> int:
 
 def _notice_failures(folder: Path, results: Results, head: str = "") -> int:
     """Say which frames failed; returns the exit status."""
-    from hwp_bench.evaluation.sentences import outcome_lines
+    from hwp_bench.evaluation.sentences import failures, outcome_lines
 
     for line in outcome_lines(folder, results, head):
         notice(line)
-    return int(any(capture.failed_frames for capture in results.captures))
+    return int(any(failures(capture) for capture in results.captures))
 
 
 def _evaluation_settings(args: argparse.Namespace) -> EvaluationSettings:

@@ -28,12 +28,9 @@ def outcome_lines(out: Path, results: Results, head: str = "") -> list[str]:
     lines = []
     for capture in results.captures:
         folder = out / "captures" / capture.id
-        lines += [
-            f"failed: {head}{text}"
-            for text in (failure_text(capture), free_view_text(capture))
-            if text
-        ]
-        if capture.failed_frames and (folder / LOG).is_file():
+        failed = failures(capture)
+        lines += [f"failed: {head}{text}" for text in failed]
+        if failed and (folder / LOG).is_file():
             lines.append(f"log: {folder / LOG}")
         lines += [f"warning: {head}{capture.id}: {text}" for text in read_warnings(folder)]
     lines += [f"warning: {head}{results.suite} {text}" for text in lost_clips(results)]
@@ -45,6 +42,11 @@ def outcome_lines(out: Path, results: Results, head: str = "") -> list[str]:
     return lines + [
         text for text in (times_text(results, head), isolation_text(results, head)) if text
     ]
+
+
+def failures(capture: CaptureResult) -> list[str]:
+    """Say which of the frames of a capture and of its free-view clip failed; empty where none."""
+    return [text for text in (failure_text(capture), free_view_text(capture)) if text]
 
 
 def failure_text(capture: CaptureResult) -> str:

@@ -176,6 +176,17 @@ def test_a_frame_that_fails_costs_itself_and_no_more(
     assert free.frames[4].scores == penalty()
 
 
+def test_a_clip_that_fails_is_said_and_gives_status_1(
+    capture: Capture, tmp_path: Path, capsys
+) -> None:
+    failing = method(tmp_path / "m", render="if self.drawn > 7: raise RuntimeError('no luck')")
+    words = ["evaluate", str(failing), "--capture", str(capture.root), "-o", str(tmp_path / "out")]
+    assert main(words) == 1
+    told = capsys.readouterr().err
+    assert "tiny, free view: 2 of 5 frames" in told
+    assert "log: " in told
+
+
 def test_a_method_that_crashes_gets_every_penalty(capture: Capture, tmp_path: Path) -> None:
     crashing = method(tmp_path / "m", fit="raise RuntimeError('no luck')")
     free = run(crashing, capture, tmp_path / "out").free_view
