@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,13 @@ from hwp_bench.analysis.columns import Filled, block_breaks, score_column, score
 from hwp_bench.analysis.compare import Ranking, macro_by_seed, macro_mean, rank_methods, verdict
 from hwp_bench.analysis.cost import BUDGETS, MethodCost, machine_notes, method_costs
 from hwp_bench.analysis.discrimination import item_statistics
-from hwp_bench.analysis.pairing import MethodRuns, common_metrics, group_runs, refuse_unlike
+from hwp_bench.analysis.pairing import (
+    MethodRuns,
+    common_metrics,
+    common_seeds,
+    group_runs,
+    refuse_unlike,
+)
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.tables import Cell, Column, Table
 from hwp_bench.capture.schema import CaptureInfo
@@ -133,27 +140,30 @@ def robustness_table(sources: Sequence[ResultsSource], base: str | None = None) 
     """Return the loss of each method by perturbed frames, and the share of it that it recovers."""
     runs = group_runs([source.results for source in sources])
     perturbed = [run for run in runs if run.first.frames == "perturbed"]
-    pairs = [(run, clean) for run in perturbed if (clean := _oracle(run, runs)) is not None]
-    if not pairs:
+    triples = [
+        _over_common_seeds(run, clean, _base(perturbed, base, run))
+        for run in perturbed
+        if (clean := _oracle(run, runs)) is not None
+    ]
+    if not triples:
         raise UsageError(
             "no method was evaluated on perturbed and on clean frames",
             field="RESULTS",
             remedy="Give the results of `evaluate` and of `evaluate --train-on clean`.",
         )
-    starts = [_base(perturbed, base, run) for run, _ in pairs]
-    start = next(filter(None, starts), None)
+    start = next((below for _, _, below in triples if below), None)
     names = common_metrics(runs, ROBUST)
     columns: list[Filled] = [
-        (Column("Method"), labels([run.first for run, _ in pairs], seeds=False))
+        (Column("Method"), labels([run.first for run, _, _ in triples], seeds=False))
     ]
     for name in names:
         label, head = metric_facts(name).label, score_column(name)
-        bases = [macro_mean(start, name) if start else None for start in starts]
-        scores = [(macro_mean(run, name), macro_mean(clean, name)) for run, clean in pairs]
+        bases = [macro_mean(below, name) if below else None for _, _, below in triples]
+        scores = [(macro_mean(run, name), macro_mean(clean, name)) for run, clean, _ in triples]
         changes = [100 * (score - best) / abs(best) if best else None for score, best in scores]
         closed = [
-            None if run is own_start else _closed(below, *own, higher=bool(head.higher_is_better))
-            for (run, _), own, own_start, below in zip(pairs, scores, starts, bases, strict=True)
+            None if run is below else _closed(floor, *own, higher=bool(head.higher_is_better))
+            for (run, _, below), own, floor in zip(triples, scores, bases, strict=True)
         ]
         perturbed_head = Column("Perturbed", head.digits, head.higher_is_better, label)
         columns += [
@@ -171,6 +181,22 @@ def robustness_table(sources: Sequence[ResultsSource], base: str | None = None) 
         "budget counts. Macro means.",
     )
     return table_of("Robustness", columns, notes)
+
+
+def _over_common_seeds(
+    run: MethodRuns, clean: MethodRuns, base: MethodRuns | None
+) -> tuple[MethodRuns, MethodRuns, MethodRuns | None]:
+    """Return the three with the seeds that all have; a run that is its own base stays that."""
+
+    def kept(one: MethodRuns, seeds: Sequence[int]) -> MethodRuns:
+        return replace(one, seeds={seed: one.seeds[seed] for seed in seeds})
+
+    seeds = common_seeds(run, clean)
+    if base is not None:
+        seeds = common_seeds(kept(run, seeds), base)
+    short = kept(run, seeds)
+    below = short if base is run else base and kept(base, seeds)
+    return short, kept(clean, seeds), below
 
 
 def _oracle(run: MethodRuns, runs: Sequence[MethodRuns]) -> MethodRuns | None:

@@ -80,6 +80,20 @@ def test_the_gap_is_counted_from_the_base_of_the_same_budget(make_results) -> No
     assert rows[0]["PSNR Gap closed [%]"] is None
 
 
+def test_robustness_is_of_the_seeds_that_all_have(make_results) -> None:
+    def run(name: str, psnr: float, seed: int, frames: str = "perturbed") -> ResultsSource:
+        return ResultsSource(replace(make_results(name, psnr), frames=frames, seed=seed), None)
+
+    mine = [run("mine", 23, 0), run("mine", 29, 1), run("mine", 24, 0, "clean")]
+    plain = [run("plain", 20, 0), run("plain", 10, 2)]
+    row = cells(robustness_table([*mine, *plain], "plain"))[0]
+    # Seed 0 alone: 23 of 24 from 20 on.
+    assert row["PSNR Perturbed"] == pytest.approx(23.5)
+    assert row["PSNR Gap closed [%]"] == pytest.approx(75)
+    with pytest.raises(UsageError, match="no seed in common"):
+        robustness_table([*mine, plain[1]], "plain")
+
+
 def test_robustness_needs_both_kinds_of_frames(make_results) -> None:
     sources = [ResultsSource(make_results(), None)]
     with pytest.raises(UsageError, match="perturbed and on clean frames"):
