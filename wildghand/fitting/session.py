@@ -36,8 +36,7 @@ from wildghand.avatar.files import (
 )
 from wildghand.fitting.components import make_fit
 from wildghand.fitting.fit import Fit
-from wildghand.fitting.method import affordable, digest_of_named_files, ready_fit
-from wildghand.fitting.objective import refuse_idle_network
+from wildghand.fitting.method import affordable, digest_of_named_files, read_usable, ready_fit
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
 from wildghand.gaussians.fit_loop import Loss
 from wildghand.model.settings import WildGHandSettings, read_settings
@@ -120,8 +119,7 @@ def fit_capture(
     Args:
         out: the avatar folder; None: nothing is written (`save_avatar` can do it later).
     """
-    chosen = read_settings(settings or {})
-    refuse_idle_network(chosen)
+    chosen = read_usable(settings or {})
     world.shard(chosen.schedule.batch)
     run = RunSettings(dict(settings or {}), seed, budget or Budget())
     if out is None and world.size > 1:
@@ -149,6 +147,7 @@ def fit_capture(
         # A process may be killed after its avatar was whole.
         if world.is_main:
             notice(f"{out} is complete: the same call has made it; --overwrite fits again")
+            shutil.rmtree(work, ignore_errors=True)
         return load_avatar(out)
     with disc_errors(work), exclusive(work) if world.is_main else contextlib.nullcontext():
         avatar = _fit_in(work, capture, split, run, world, watch)

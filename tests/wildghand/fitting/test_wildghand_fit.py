@@ -277,11 +277,13 @@ def test_the_commands_make_draw_and_export_an_avatar(
     assert not (tmp_path / "avatar.fit").exists()
     assert "5 steps" in capsys.readouterr().out
     assert main(["fit", str(capture), "-o", str(avatar)]) == 2
-    # The same call finds it complete, as after a kill in the last moment.
+    # The same call finds it complete, as after a kill in the last moment, and takes the state away.
+    (tmp_path / "avatar.fit").mkdir()
     before = (avatar / "model.safetensors").stat().st_mtime_ns
     assert main(["fit", str(capture), "-o", str(avatar), "--steps", "5", *options]) == 0
     shown = capsys.readouterr()
     assert "is complete: the same call has made it" in shown.err
+    assert not (tmp_path / "avatar.fit").exists()
     assert "5 steps" in shown.out
     assert (avatar / "model.safetensors").stat().st_mtime_ns == before
     pictures = tmp_path / "pictures"
