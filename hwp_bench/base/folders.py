@@ -86,7 +86,7 @@ def scratch_folder(prefix: str) -> Iterator[Path]:
         yield folder
     finally:
         lock.release()
-        shutil.rmtree(folder, ignore_errors=True)
+        remove_tree(folder)
 
 
 def remove_left(prefix: str) -> None:
@@ -103,10 +103,10 @@ def remove_left(prefix: str) -> None:
             file = folder / LOCK
             if file.is_symlink() or not file.is_file():
                 if time.time() - facts.st_mtime > UNLOCKED_SECONDS:
-                    shutil.rmtree(folder, ignore_errors=True)
+                    remove_tree(folder)
                 continue
             with FileLock(file, timeout=0):
-                shutil.rmtree(folder, ignore_errors=True)
+                remove_tree(folder)
 
 
 #: Deepest folder that a run has a reason to write, below its output.

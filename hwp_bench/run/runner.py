@@ -180,6 +180,7 @@ def rehearse_method(
         asked = {"settings": unfold(settings.settings), "seed": settings.seed}
         write_json(request / REHEARSAL, asked)
         outcome, _ = _run(manifest, request, output, confinement, limits, None, ("--rehearse",))
+        open_up(output)  # before anything in it is read: it may hold links and pipes
         if outcome.status != 0:
             lines = last_lines(output / LOG)
             # One line is the reason itself.

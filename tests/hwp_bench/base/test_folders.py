@@ -273,6 +273,12 @@ def test_a_thousand_levels_are_removed(tmp_path: Path) -> None:
     remove_tree(folder)
 
 
+def test_a_deep_folder_does_not_stay_in_a_scratch_folder() -> None:
+    with scratch_folder("hwp-deep-") as folder:
+        nested(folder)
+    assert not folder.exists()
+
+
 def test_what_is_closed_is_opened_and_what_is_odd_goes(tmp_path: Path) -> None:
     folder = tmp_path / "output"
     (folder / "predictions").mkdir(parents=True)

@@ -17,9 +17,11 @@ from small_methods import SUBMISSION, write_manifest
 
 from hwp_bench.base.errors import MethodFailed
 from hwp_bench.evaluation.scoring import read_prediction
+from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.manifest import read_manifest
-from hwp_bench.run.runner import run_method
+from hwp_bench.run.runner import rehearse_method, run_method
 from hwp_bench.run.sandbox import supervise
+from hwp_bench.run.sandbox.confinement import Confinement
 
 MODES = ("required", "none")
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="process control is Linux's")
@@ -81,6 +83,31 @@ print("overwritten")
     with pytest.raises(FileNotFoundError):  # by the test's own look at the log
         attack(script, mode)
     assert secret.read_text() == "s3cret"
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("left", ["link", "pipe"])
+def test_a_rehearsal_reads_nothing_that_was_put_in_its_place(
+    tmp_path: Path, mode: str, left: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    secret = folder_of(tmp_path / "home") / "secret"
+    secret.write_text("s3cret\n" * 3)
+    put = f"os.symlink({str(secret)!r}, name)" if left == "link" else "os.mkfifo(name)"
+    method = folder_of(tmp_path / "method")
+    (method / "odd.py").write_text(
+        f"""
+import os
+for name in ("log.txt", "failure.json"):
+    if os.path.lexists(name):
+        os.unlink(name)
+    {put}
+os._exit(1)
+"""
+    )
+    write_manifest(method, "odd", 'python = "odd:Method"')
+    with pytest.raises(MethodFailed, match="cannot be made: exit status 1"):
+        rehearse_method(read_manifest(method), RunSettings(), confinement=Confinement(mode))
+    assert "s3cret" not in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("which", ["frame", "folder"])
