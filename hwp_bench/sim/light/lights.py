@@ -140,9 +140,14 @@ class AreaLight:
         )
 
     def at(self, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
-        """Irradiance at (3,) points of a surface with a normal (3,), from the centre: (3,)."""
+        """Irradiance at (3,) points of a surface with a normal (3,), from the centre: (3,).
+
+        0 at the centre itself, as behind the lamp.
+        """
         way = self.centre - points
         squared = float(way @ way)
+        if squared == 0.0:
+            return np.zeros(3)
         cosine = float(way @ normal) / np.sqrt(squared)
         leaving = -float(way @ self.facing) / np.sqrt(squared)
         share = max(cosine, 0.0) * max(leaving, 0.0) * self.distance**2 / squared

@@ -91,6 +91,12 @@ def test_a_small_lamp_follows_the_inverse_square(
     np.testing.assert_allclose(seen[0], expected, rtol=1e-3)
 
 
+def test_a_lamp_lights_no_point_in_its_own_place() -> None:
+    # A lamp one metre behind the hand lies where the backdrop's light is asked for.
+    light = area_light(Lamp(place=(0.0, 0.0, 1.0), strength=1.0))
+    np.testing.assert_array_equal(light.at(light.centre, np.array([0.0, 0.0, -1.0])), 0.0)
+
+
 def test_a_window_is_the_integral_over_its_area() -> None:
     # Oracle: the four samples of a pixel against 200 x 200 points of the same rectangle.
     lamp = area_light(Lamp(place=(-0.8, 0.0, -0.3), strength=1.0, width=1.2))
