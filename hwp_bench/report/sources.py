@@ -171,7 +171,8 @@ def _located(
 ) -> dict[str, tuple[CaptureInfo, Path]]:
     """The descriptions and folders of the captures, by digest."""
     digests = {c.digest: c.id for result in results for c in result.captures}
-    places = [Path(folder) for folder in folders]
+    given = [Path(folder) for folder in folders]
+    places = list(given)
     caches = [cache_root() / kind / "captures" for kind in ("sim", "real")]
     for identifier in sorted(set(digests.values())):
         # A name from outside matches itself and nothing else.
@@ -183,10 +184,14 @@ def _located(
         try:
             info = CaptureInfo.from_json(read_json(path), where=os.fspath(path))
         except HwpError:
+            if place in given:
+                raise
             continue
         digest = digest_at(place, info)
         if digest in digests:
             found[digest] = (info, place)
+        elif place in given:
+            notice(f"left out: {place} is not a capture of these results")
     return found
 
 

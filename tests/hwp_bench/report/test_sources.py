@@ -11,7 +11,7 @@ from made_results import made_results
 from small_captures import results_example
 
 from hwp_bench.analysis.pairing import group_runs
-from hwp_bench.base.errors import UsageError
+from hwp_bench.base.errors import HwpError, UsageError
 from hwp_bench.base.tables import Column, Table
 from hwp_bench.cli.main import main
 from hwp_bench.report.requested_table import TableRequest, make_table
@@ -19,6 +19,7 @@ from hwp_bench.report.sources import (
     DataGroup,
     ResultsSource,
     data_groups,
+    find_captures,
     read_sources,
     stacked,
 )
@@ -117,6 +118,14 @@ def test_captures_of_two_versions_of_an_importer_are_named(tmp_path: Path, capsy
     assert warning in capsys.readouterr().out
     assert main(["table", *paths[1:], "--format", "md"]) == 0
     assert "different importers" not in capsys.readouterr().out
+
+
+def test_a_capture_that_was_named_is_never_passed_over(make_capture, tmp_path, capsys) -> None:
+    results, other = made_results("mine", level(20.0)), make_capture("other")
+    with pytest.raises(HwpError, match="nowhere"):
+        find_captures([results], [tmp_path / "nowhere"])
+    assert find_captures([results], [other.root]) == {}
+    assert f"{other.root} is not a capture of these results" in capsys.readouterr().err
 
 
 def test_tables_with_other_columns_are_put_under_one_another() -> None:
