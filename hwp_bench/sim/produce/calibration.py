@@ -102,13 +102,17 @@ def write_strengths(path: Path, calibrations: list[Calibration]) -> None:
 
 def _with_strengths(text: str, item: Calibration, where: str) -> str:
     line = f"strengths = [{', '.join(repr(value) for value in item.strengths)}]"
-    pattern = re.compile(rf'(^kind = "{item.kind}"\n)(strengths = .*\n)?', re.MULTILINE)
-    changed, count = pattern.subn(rf"\g<1>{line}\n", text)
-    if count != 1:
-        raise BadInput(
-            f"names {item.kind} {count} times as a line of its own", where=where, field="effects"
-        )
-    return changed
+    # A table begins at a bracket at the start of a line; rows of an array are indented.
+    tables = re.split(r"^(?=\[)", text, flags=re.MULTILINE)
+    kind = re.compile(rf'^kind = "{item.kind}"\n', re.MULTILINE)
+    own = [number for number, table in enumerate(tables) for _ in kind.findall(table)]
+    if len(own) != 1:
+        problem = f"names {item.kind} {len(own)} times as a line of its own"
+        raise BadInput(problem, where=where, field="effects")
+    before = re.compile(r"^strengths\s*=\s*\[[^\]]*\][^\n]*\n?", re.MULTILINE)
+    rest = before.sub("", tables[own[0]])
+    tables[own[0]] = kind.sub(lambda found: f"{found[0]}{line}\n", rest)
+    return "".join(tables)
 
 
 def _measure(

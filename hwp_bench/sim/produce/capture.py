@@ -281,6 +281,7 @@ def _render_missing(request: RenderRequest, waiting: Path, on_progress: OnProgre
     workers = request.workers
     if workers is None:
         workers = max(1, min(os.cpu_count() or 1, left // _FRAMES_PER_WORKER))
+    workers = max(1, min(workers, left))
     # The clip's frames are dealt out from the other end, so that every process has as many.
     works = [
         RenderFrames(request, missing[first::workers], unseen[workers - 1 - first :: workers])

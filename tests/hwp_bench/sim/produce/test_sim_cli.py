@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import tomllib
 from pathlib import Path
 
@@ -141,6 +142,23 @@ def test_the_digest_is_that_of_the_written_strengths(
         scene_files._shipped_scene.cache_clear()
     (row,) = json.loads(capsys.readouterr().out)
     assert row["digest"] == load_scene(scene_file).digest
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_strengths_are_replaced_wherever_the_effect_has_them(scene_file: Path, first: bool) -> None:
+    kind, old = 'kind = "illumination"\n', "strengths = [\n  0.1, 0.2, 0.3,\n  0.4, 0.5,\n]\n"
+    text = scene_file.read_text()
+    assert text.count(kind) == 1
+    head, tail = text.split(kind)
+    own, *others = re.split(r"^(?=\[)", tail, flags=re.MULTILINE)
+    own = re.sub(r"^strengths = .*\n", "", own, flags=re.MULTILINE)
+    table = old + kind + own if first else kind + own.rstrip("\n") + "\n" + old
+    scene_file.write_text(head + table + "".join(others))
+    item = Calibration("illumination", "psnr", (0.2, 0.3, 0.4, 0.5, 0.6), (1.0,) * 5, (1.0,) * 5)
+    write_strengths(scene_file, [item])
+    call = load_scene(scene_file).effect("illumination")
+    assert call is not None
+    assert call.strengths == item.strengths
 
 
 def test_strengths_are_written_into_the_file(scene_file: Path) -> None:
