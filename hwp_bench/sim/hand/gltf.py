@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
+from urllib.parse import unquote
 
 import numpy as np
 
@@ -193,7 +194,7 @@ class _Gltf:
     def files(self) -> list[Path]:
         """The file, and the others that it names and that are there."""
         uris = [part.uri for part in (*self.content.buffers, *self.content.images) if part.uri]
-        named = [inside(self.path.parent, uri) for uri in uris if not uri.startswith("data:")]
+        named = [self._beside(uri) for uri in uris if not uri.startswith("data:")]
         return [self.path, *(file for file in named if file.is_file())]
 
     def chain(self, node: int) -> list[int]:
@@ -229,13 +230,18 @@ class _Gltf:
         uri = self.content.buffers[index].uri
         return bytes(self.content.binary_blob() or b"") if uri is None else self._uri(uri)
 
+    def _beside(self, uri: str) -> Path:
+        """The file that a URI names; glTF 2.0 encodes its names, and some programs do not."""
+        plain = inside(self.path.parent, uri)
+        return plain if plain.is_file() else inside(self.path.parent, unquote(uri))
+
     def _uri(self, uri: str) -> bytes:
         if uri.startswith("data:"):
             try:
                 return base64.b64decode(uri.split(",", 1)[1])
             except (IndexError, binascii.Error) as error:
                 raise self.wrong("holds damaged data") from error
-        target = inside(self.path.parent, uri)
+        target = self._beside(uri)
         if not target.is_file() or target.stat().st_size > MAX_BYTES:
             raise self.wrong(f"names {uri!r}, which does not exist or is too large")
         return target.read_bytes()

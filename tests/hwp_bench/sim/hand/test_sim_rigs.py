@@ -150,6 +150,19 @@ def test_another_rig_in_the_same_place_is_another_render(
     assert render_key(scene, 10, 48) != before
 
 
+def test_names_of_files_may_be_encoded(tmp_path: Path) -> None:
+    rig = pygltflib.GLTF2().load(str(rig_path("rig:generic-hand")))
+    (tmp_path / "my hand.bin").write_bytes(rig.binary_blob())
+    model, file = load_template("anny", "right"), tmp_path / "hand.gltf"
+    shipped, _ = load_rig(str(rig_path("rig:generic-hand")), "right", model)
+    for name in ("my%20hand.bin", "my hand.bin"):
+        rig.buffers[0].uri = name
+        rig.save_json(str(file))
+        np.testing.assert_array_equal(
+            load_rig(str(file), "right", model)[0].vertices, shipped.vertices
+        )
+
+
 def test_what_ships_keeps_its_key(make_scene: Callable[..., Scene]) -> None:
     # Oracle: the definition. Captures in caches are found by it.
     for model in ("anny", "rig:generic-hand"):
