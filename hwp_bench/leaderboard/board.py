@@ -14,7 +14,7 @@ from hwp_bench.leaderboard.entries import BADGES, LEVELS, Entry
 from hwp_bench.leaderboard.rules import HEADLINE, current, source_of, tables_of, takes_over
 from hwp_bench.leaderboard.suite_data import Severities, on_current_data, suite_severities
 from hwp_bench.metrics import HWP_V1
-from hwp_bench.metrics.score import CaptureScores
+from hwp_bench.metrics.score import CaptureScores, mean_scores
 from hwp_bench.report.study_tables import METRIC
 from hwp_bench.results import CaptureResult, Results
 from hwp_bench.results.schema import TRAINING_KINDS, budget_text, score_rows
@@ -105,9 +105,7 @@ class BoardRow:
     @cached_property
     def scores(self) -> Mapping[str, float]:
         """Headline scores by metric, means over the seeds; of metrics that every seed has."""
-        found = [one.scores for one in self.runs]
-        names = [name for name in found[0] if all(name in one for one in found)]
-        return {name: sum(one[name] for one in found) / len(found) for name in names}
+        return mean_scores(one.scores for one in self.runs)
 
     @cached_property
     def scopes(self) -> Mapping[str, Mapping[str, float | None]]:

@@ -292,13 +292,12 @@ def aggregate(captures: Iterable[CaptureScores]) -> Aggregate:
 
 
 def mean_scores(rows: Iterable[Mapping[str, float]]) -> Scores:
-    """Mean of each metric over `rows`, which all have the same metrics; {} for no rows."""
+    """Mean over `rows` of each metric that all of them have; {} for no rows."""
     listed = list(rows)
     if not listed:
         return {}
-    return {
-        name: math.fsum(row[name] for row in listed) / len(listed) for name in sorted(listed[0])
-    }
+    names = sorted(set(listed[0]).intersection(*listed[1:]))
+    return {name: math.fsum(row[name] for row in listed) / len(listed) for name in names}
 
 
 def _summarize(captures: Sequence[CaptureScores]) -> Summary:

@@ -187,7 +187,7 @@ def _column(name: str, group: str = "") -> Column:
 
 
 def _means(run: MethodRuns) -> dict[str, Scores]:
-    """Return mean scores over seeds by scope, of the metrics that every seed has."""
+    """Return mean scores over seeds by scope."""
     found: dict[str, list[Scores]] = {}
     for result in run.seeds.values():
         mean = aggregate(score_rows(result))
@@ -197,14 +197,7 @@ def _means(run: MethodRuns) -> dict[str, Scores]:
         scopes |= {name: summary.capture_mean for name, summary in groups if summary is not None}
         for scope, scores in scopes.items():
             found.setdefault(scope, []).append(scores)
-    shared = {
-        scope: [name for name in rows[0] if all(name in row for row in rows)]
-        for scope, rows in found.items()
-    }
-    return {
-        scope: mean_scores([{name: row[name] for name in shared[scope]} for row in rows])
-        for scope, rows in found.items()
-    }
+    return {scope: mean_scores(rows) for scope, rows in found.items()}
 
 
 def _notes(runs: Sequence[MethodRuns]) -> list[str]:

@@ -456,3 +456,5 @@ def test_missing_frames_metrics_and_captures_are_refused():
 
 def test_mean_of_nothing_is_nothing():
     assert mean_scores([]) == {}
+    # What one row lacks has no mean.
+    assert mean_scores([{"a": 1.0, "b": 2.0}, {"a": 3.0}, {"c": 9.0, "a": 5.0}]) == {"a": 3.0}
