@@ -55,6 +55,8 @@ CROSS_TOLERANCE = 1e-6
 CROSS_SAMPLE = 4
 # Longest value of a field that a difference repeats.
 _SHOWN = 100
+# What is found where no predictions are kept.
+_NONE = "no predictions"
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,11 @@ class Discrepancy:
     recorded: str
     #: Its value as it was found.
     found: str
+
+    @property
+    def not_here(self) -> bool:
+        """Whether it shows only that a capture, a clip or the predictions are others or absent."""
+        return self.what == "capture" or (self.what, self.found) == ("predictions", _NONE)
 
 
 @dataclass(frozen=True)
@@ -251,7 +258,8 @@ class _Scorer:
         scored = score_frames_of(targets, folder, size, self.networks)
         self.frames += len(targets)
         if scored.digest != record.predictions_digest:
-            yield Discrepancy(name, "predictions", record.predictions_digest, scored.digest)
+            seen = scored.digest if folder.is_dir() else _NONE
+            yield Discrepancy(name, "predictions", record.predictions_digest, seen)
         for old, new in zip(record.frames, scored.scores, strict=True):
             yield from _frame_differences(name, old, new)
         # Some scores are compared with scikit-image's too.

@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import Literal, cast
 
 from hwp_bench.base.errors import BadResult, UsageError
-from hwp_bench.base.files import atomic_folder, files_digest, inside, sha256_of
+from hwp_bench.base.files import atomic_folder, files_digest, sha256_of
 from hwp_bench.base.packages import __version__
-from hwp_bench.evaluation.artifacts import FREE_PREDICTIONS
 from hwp_bench.evaluation.scoring import predictions_digest, read_predictions
-from hwp_bench.evaluation.verify import Discrepancy, verify_results
+from hwp_bench.evaluation.verify import verify_results
 from hwp_bench.leaderboard.entries import (
     Check,
     Contest,
@@ -220,7 +219,7 @@ def confirm(
     own = entry.results == results
     found = verify_results(file, captures)
     differences = len(found.discrepancies)
-    absent = [one for one in found.discrepancies if _not_here(one, file.parent)]
+    absent = [one for one in found.discrepancies if one.not_here]
     if own and absent:
         # Nothing was found out about the row, and a check cannot be taken back.
         raise BadResult(
@@ -263,13 +262,6 @@ def confirm(
         overrules=overruled,
         reason=reason,
     )
-
-
-def _not_here(difference: Discrepancy, folder: Path) -> bool:
-    """Whether a capture, a clip or the predictions of a result are absent or others here."""
-    capture, _, clip = difference.capture.partition(", ")
-    kept = inside(folder, f"captures/{capture}/{FREE_PREDICTIONS if clip else 'predictions'}")
-    return difference.what == "capture" or (difference.what == "predictions" and not kept.is_dir())
 
 
 def _overruled(entry: Entry, named: Sequence[str]) -> list[str]:
