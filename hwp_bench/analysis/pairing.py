@@ -65,9 +65,7 @@ def group_runs(results: Sequence[Results]) -> list[MethodRuns]:
     for result in results:
         seeds = groups.setdefault(same_but_seed(result), {})
         if result.seed in seeds:
-            between = f"two results of {result.method.title}"
-            refuse_other_scoring(between, seeds[result.seed], result)
-            _same_captures(between, seeds[result.seed], result)
+            _refuse_unlike_pair(f"two results of {result.method.title}", seeds[result.seed], result)
             raise UsageError(
                 f"two results are of {result.method.title} with seed {result.seed} and the same "
                 "settings",
@@ -116,9 +114,12 @@ def refuse_unlike(runs: Sequence[MethodRuns]) -> None:
     everything = [(run.label, result) for run in runs for result in run.seeds.values()]
     label, reference = everything[0]
     for other_label, other in everything[1:]:
-        between = f"{label} and {other_label}"
-        refuse_other_scoring(between, reference, other)
-        _same_captures(between, reference, other)
+        _refuse_unlike_pair(f"{label} and {other_label}", reference, other)
+
+
+def _refuse_unlike_pair(between: str, reference: Results, other: Results) -> None:
+    refuse_other_scoring(between, reference, other)
+    _same_captures(between, reference, other)
 
 
 def refuse_other_scoring(between: str, reference: Results, other: Results) -> None:

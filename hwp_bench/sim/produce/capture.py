@@ -278,10 +278,8 @@ def _render_missing(request: RenderRequest, waiting: Path, on_progress: OnProgre
     scene_hands(scene)
     for side in scene.sides:
         skin_atlas(of_side(scene.subject, side), side)
-    workers = request.workers
-    if workers is None:
-        workers = max(1, min(os.cpu_count() or 1, left // _FRAMES_PER_WORKER))
-    workers = max(1, min(workers, left))
+    asked = request.workers or min(os.cpu_count() or 1, left // _FRAMES_PER_WORKER)
+    workers = max(1, min(asked, left))
     # The clip's frames are dealt out from the other end, so that every process has as many.
     works = [
         RenderFrames(request, missing[first::workers], unseen[workers - 1 - first :: workers])
