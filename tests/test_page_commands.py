@@ -137,7 +137,7 @@ def fill(folder: Path, world: Path, commands: list[list[str]]) -> None:
 def test_reasons_and_pages_are_of_commands_that_are_there() -> None:
     lines = [" ".join(words) for page in PAGES.values() for words in example_commands(page)]
     assert [p for p in NOT_RUN if not any(re.match(p, line) for line in lines)] == []
-    assert sum(map(len, RUN.values())) >= 70
+    assert sum(map(len, RUN.values())) > 70
     assert all((ROOT / "tests" / test).is_file() for test in ELSEWHERE.values())
 
 
