@@ -330,33 +330,12 @@ def encode_frames(frames: Tensor, frame_count: int) -> Tensor:
     return torch.cat([waves, place[:, None]], dim=-1).float()
 
 
-def drop(omega: Tensor, probability: Tensor | float, generator: torch.Generator) -> Tensor:
-    """Set temporal weights to 0 at random, the paper's probability being 0.3 for every frame.
-
-    Args:
-        omega: (B,).
-        probability: in [0, 1], one for all or (B,): frames that are known to be perturbed may
-            keep their weights, with 0.
-
-    Returns:
-        (B,); a dropped frame passes no gradient.
-    """
-    chance = torch.as_tensor(probability, dtype=torch.float32).detach().cpu()
-    if not bool(((chance >= 0.0) & (chance <= 1.0)).all()):
-        raise UsageError("is outside [0, 1]", field="probability")
-    if chance.ndim and chance.shape != omega.shape:
-        raise ShapeMismatch(
-            f"has shape {tuple(chance.shape)}, omega {tuple(omega.shape)}", field="probability"
-        )
-    kept = draw_kept(chance.expand(omega.shape), generator)
-    return torch.where(kept.to(omega.device), omega, torch.zeros_like(omega))
-
-
 def draw_kept(probability: Tensor, generator: torch.Generator) -> Tensor:
-    """Which of B frames keep their temporal weights in a step; see `drop`.
+    """Which of B frames keep their temporal weights in a step.
 
     Args:
-        probability: (B,) in [0, 1] that a frame does not, on the CPU.
+        probability: (B,) in [0, 1] that a frame does not, on the CPU: the paper's is 0.3 for all;
+            frames that are known to be perturbed may keep theirs, with 0.
 
     Returns:
         (B,) bool, where the generator is.

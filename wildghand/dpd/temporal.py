@@ -165,6 +165,7 @@ def scale_gradients(prediction: NetworkOutput, shares: Tensor) -> NetworkOutput:
             **{name: _by_frame(values, shares) for name, values in prediction.raw.items()}
         ),
         shadow=_by_frame(prediction.shadow, shares),
+        xi=_by_frame(prediction.xi, shares),
         template_offsets=_by_frame(prediction.template_offsets.expand(len(shares), -1, -1), shares),
         refinement=scale_refinement(prediction.refinement, shares),
     )

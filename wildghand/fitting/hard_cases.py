@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from hwp_bench.stability import Case, Context, Measured, largest
-from wildghand.dpd.dpd import DynamicPerturbation, drop
+from wildghand.dpd.dpd import DynamicPerturbation, FramePerturbation, draw_kept
 from wildghand.dpd.temporal import TemporalTarget
 from wildghand.gaussians.attributes import CHANNELS, RawAttributes
 from wildghand.gaussians.perceptual import FilterBankLoss
@@ -197,9 +197,9 @@ def _run_begun(clean: list[float], context: Context) -> Measured:
 def _run_dropped(context: Context) -> Measured:
     module = _module(2)
     torch.nn.init.ones_(module.psi.weight)
-    temporal = module.temporal(torch.arange(2))
-    omega = drop(temporal.omega, 1.0, torch.Generator().manual_seed(0))
-    biases = module.biases(_attributes(2), temporal.z, omega).concatenate()
+    kept = draw_kept(torch.ones(2), torch.Generator().manual_seed(0))
+    frames = FramePerturbation(module, module.temporal(torch.arange(2)), kept)
+    biases = frames.biases(_attributes(2)).concatenate()
     biases.sum().backward()
     size = largest(_gradient(p) for p in module.parameters())
     return Measured(bool((biases == 0.0).all()) and size == 0.0, f"largest {size:g}")

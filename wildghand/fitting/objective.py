@@ -77,7 +77,7 @@ class Regularisers(Component):
                     size = module.sum_of_means(raw.concatenate(), z).square().mean()
                 yield weights.bias * size
             for weight, values in (
-                (weights.shadow, hand.prediction.shadow),
+                (weights.shadow, hand.prediction.xi),
                 (weights.opacity, hand.opacities),
             ):
                 if weight:

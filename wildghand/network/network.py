@@ -68,14 +68,15 @@ class NetworkOutput:
 
     #: (B, N, k) attributes before `PredictionNetwork.activation`.
     raw: RawAttributes
-    #: (B, N, 1) xi in (0, 1); the colour that is drawn is sigmoid(logit_colors) * xi.
+    #: (B, N, 1) xi in (0, 1), times shading and cast shadow once a model has a light; the colour
+    #: that is drawn is sigmoid(logit_colors) * shadow.
     shadow: Tensor
     #: (N, 3) m, displacement of the template in the anchors' frames.
     template_offsets: Tensor
     #: Corrections of the hand parameters.
     refinement: Refinement
-    #: (N, Ft) texture features.
-    texture: Tensor
+    #: (B, N, 1) xi alone.
+    xi: Tensor
 
 
 class PredictionNetwork(nn.Module):
@@ -208,7 +209,7 @@ class PredictionNetwork(nn.Module):
             shadow=shadow,
             template_offsets=hand.template_offsets,
             refinement=Refinement(pose_change, hand.betas, transl_change),
-            texture=hand.texture,
+            xi=shadow,
         )
 
     def attributes_of_texture(self, side: str, features: HandFeatures) -> RawAttributes:

@@ -11,7 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hwp_bench.base.errors import BadInput, ShapeMismatch, UsageError
-from wildghand.dpd.dpd import DynamicPerturbation, drop, encode_frames
+from wildghand.dpd.dpd import (
+    DynamicPerturbation,
+    FramePerturbation,
+    draw_kept,
+    encode_frames,
+)
 from wildghand.gaussians.attributes import SIZES, RawAttributes
 
 
@@ -134,28 +139,26 @@ def test_omega_stays_in_its_range(logit: float) -> None:
     assert (omega.abs() <= 1.0).all()
 
 
-def test_drop_keeps_its_probability_frame_by_frame_and_repeats() -> None:
-    omega = torch.full((4000,), 0.5)
+def test_frames_are_dropped_with_their_probability_and_repeat() -> None:
     chance = torch.zeros(4000)
     chance[:2000] = 0.3
-    first = drop(omega, chance, torch.Generator().manual_seed(1))
-    again = drop(omega, chance, torch.Generator().manual_seed(1))
-    assert torch.equal(first, again)
-    assert (first[2000:] == 0.5).all()
+    kept = draw_kept(chance, torch.Generator().manual_seed(1))
+    assert torch.equal(kept, draw_kept(chance, torch.Generator().manual_seed(1)))
+    assert kept[2000:].all()
     # Four standard deviations of a binomial share.
-    assert abs(float((first[:2000] == 0.0).float().mean()) - 0.3) < 4 * math.sqrt(0.21 / 2000)
-    generator = torch.Generator().manual_seed(1)
-    assert (drop(omega, 1.0, generator) == 0.0).all()
-    assert torch.equal(drop(omega, 0.0, generator), omega)
+    assert abs(float((~kept[:2000]).float().mean()) - 0.3) < 4 * math.sqrt(0.21 / 2000)
+    assert not draw_kept(torch.ones(100), torch.Generator()).any()
 
 
-def test_drop_draws_nothing_from_the_global_generator_and_stops_the_gradient() -> None:
-    omega = torch.tensor([0.2, 0.4], requires_grad=True)
-    state = torch.get_rng_state()
-    kept = drop(omega, torch.tensor([1.0, 0.0]), torch.Generator())
+def test_a_dropped_frame_has_no_weight_and_no_gradient_and_costs_no_global_random_number() -> None:
+    module, state = trained(), torch.get_rng_state()
+    kept = draw_kept(torch.tensor([1.0, 0.0]), torch.Generator())
     assert torch.equal(state, torch.get_rng_state())
-    kept.sum().backward()
-    assert omega.grad.tolist() == [0.0, 1.0]
+    temporal = module.temporal(torch.arange(2))
+    (own,) = torch.autograd.grad(
+        FramePerturbation(module, temporal, kept).omega.sum(), temporal.omega
+    )
+    assert own.tolist() == [0.0, 1.0]
 
 
 def test_bad_arguments_are_named() -> None:
@@ -166,10 +169,6 @@ def test_bad_arguments_are_named() -> None:
             module.temporal(torch.tensor(frames))
     with pytest.raises(ShapeMismatch):
         module.biases(attributes(3, 4), temporal.z, temporal.omega)
-    with pytest.raises(UsageError, match="probability"):
-        drop(temporal.omega, float("nan"), torch.Generator())
-    with pytest.raises(ShapeMismatch, match="probability"):
-        drop(temporal.omega, torch.zeros(3), torch.Generator())
     with pytest.raises(UsageError, match="frame_count"):
         DynamicPerturbation(0)
 

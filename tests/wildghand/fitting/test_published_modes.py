@@ -32,6 +32,7 @@ from wildghand.gaussians.fit_loop import Loss
 from wildghand.gaussians.regularizers import surface_laplacian
 from wildghand.model import terms
 from wildghand.model.frames import HandState
+from wildghand.model.model import dimmed
 from wildghand.model.settings import read_settings
 from wildghand.plain import loop
 
@@ -126,6 +127,26 @@ def test_the_loss_is_the_sum_of_its_terms(mode: str, make_training: TrainingMake
             # No term could be left out unseen.
             assert min(map(abs, sums.values())) > 1e-4 * abs(found), sums
     assert total == pytest.approx(sum(sum(s.values()) for s in expected.values()), rel=1e-5)
+
+
+def test_shading_and_cast_shadows_are_not_the_coefficient_s(make_training: TrainingMaker) -> None:
+    fit, batch = fit_of(make_training("both"), "paper"), StepBatch(ROWS)
+    with torch.no_grad():
+        drawing = fit.draw(batch)
+        target, regularisers = fit.compare(batch, drawing), part(fit, Regularisers)
+        dark = torch.full(drawing.hands["right"].prediction.shadow.shape[:2], 0.3)
+        shaded = replace(
+            drawing,
+            hands={
+                side: replace(hand, prediction=dimmed(hand.prediction, dark))
+                for side, hand in drawing.hands.items()
+            },
+        )
+        before, after = (
+            [float(term) for term in regularisers.loss(fit, batch, one, target)]
+            for one in (drawing, shaded)
+        )
+    assert before == after
 
 
 def test_in_paper_a_frame_whose_omega_is_dropped_has_no_temporal_factor(
