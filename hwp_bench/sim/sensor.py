@@ -187,7 +187,7 @@ def _encoder(av: ModuleType, size: tuple[int, int], bits_per_pixel: float, fps: 
         "gop_size": KEYFRAME_EVERY,
         "max_b_frames": 0,
         "thread_count": 1,
-        "options": {"preset": PRESET, "x264-params": f"{most}:threads=1:rc-lookahead=10"},
+        "options": {"preset": PRESET, "x264-params": f"{images.REPEATABLE}:{most}:rc-lookahead=10"},
     }
     for name, value in settings.items():
         setattr(encoder, name, value)

@@ -12,6 +12,7 @@ import pytest
 from browser import open_page
 from PIL import Image
 
+from hwp_bench.base import images
 from hwp_bench.base.errors import BadImage, HwpError, MissingDependency, ShapeMismatch
 from hwp_bench.base.images import (
     as_float,
@@ -291,6 +292,21 @@ def test_frames_are_shown_when_they_were_recorded(tmp_path: Path) -> None:
     with av.open(str(path)) as container:
         found = [float(frame.pts * frame.time_base) for frame in container.decode(video=0)]
     np.testing.assert_allclose(found, times, atol=1e-4)
+
+
+def test_every_processor_writes_the_same_movie(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Oracle: x264 without SIMD."""
+    noise = np.random.default_rng(0).integers(40, 220, (16, 16, 3), dtype=np.uint8)
+    frames = clip(12, 48, 48)
+    for step, frame in enumerate(frames):
+        frame[8:24, 4 + step : 20 + step] = noise
+    one = write_movie(tmp_path / "one.mp4", frames, FPS)
+    monkeypatch.setattr(images, "REPEATABLE", f"{images.REPEATABLE}:asm=0")
+    np.testing.assert_array_equal(
+        decoded(one), decoded(write_movie(tmp_path / "two.mp4", frames, FPS))
+    )
 
 
 def test_what_cannot_be_written_leaves_nothing(

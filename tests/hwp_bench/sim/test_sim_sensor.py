@@ -20,6 +20,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_scene import BLUR, CLEAN, LIGHT, OBJECT, SceneMaker
 
+from hwp_bench.base import images
 from hwp_bench.base.errors import BadInput, HwpError
 from hwp_bench.capture import open_capture
 from hwp_bench.sim.effects import ORDER, plan_frame
@@ -245,6 +246,15 @@ def test_a_clip_keeps_its_frames_and_loses_less_with_more_bits(height: int, widt
             assert bits < 2.0 or int(distances.argmin()) == number
         losses.append(float(np.square(np.array(stored, dtype=float) - frames).mean()))
     assert losses[0] > losses[1] > losses[2]
+
+
+@pytest.mark.parametrize("bits", [0.1, 0.3, 2.0])
+def test_every_processor_stores_the_same_bits(bits: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Oracle: x264 without SIMD.
+    frames = _clip(48, 48)
+    stored = list(through_h264(iter(frames), bits, 30.0, "clip"))
+    monkeypatch.setattr(images, "REPEATABLE", f"{images.REPEATABLE}:asm=0")
+    np.testing.assert_array_equal(stored, list(through_h264(iter(frames), bits, 30.0, "clip")))
 
 
 def test_frames_are_predicted_from_those_before() -> None:
