@@ -19,7 +19,7 @@ from hwp_bench.base.colors import LUMA
 from hwp_bench.base.console import notice
 from hwp_bench.base.drawing import labelled, sheet
 from hwp_bench.base.errors import BadInput
-from hwp_bench.base.images import write_image
+from hwp_bench.base.images import pixel_digest, write_image
 from hwp_bench.hands.raster import draw_dots
 from hwp_bench.hands.skeleton import LANDMARK_EDGES, SIDES, draw_bones
 from hwp_bench.importers.shared.frames import cells
@@ -195,10 +195,6 @@ def say_faults(source: VideoSource, out: str | os.PathLike[str], options: VideoI
     Raises:
         BadInput: by `options.strict`, nothing useful can come of it.
     """
-    # The folder `.` has a name only in full.
-    whole = Path(out).absolute()
-    place = whole.with_name(f"{whole.name}_tracked.jpg")
-    place.unlink(missing_ok=True)
     qualities = {side: measure(source, hand) for side, hand in source.hands.items()}
     faults = [
         fault
@@ -207,7 +203,13 @@ def say_faults(source: VideoSource, out: str | os.PathLike[str], options: VideoI
     ]
     if not faults:
         return
-    write_image(place, _thumbnails(source, qualities))
+    drawn = _thumbnails(source, qualities)
+    # The folder `.` has a name only in full. By its content: a file with this name is the same
+    # sheet, so that none of a person is replaced.
+    whole = Path(out).absolute()
+    place = whole.with_name(f"{whole.name}_tracked_{pixel_digest(drawn)[:8]}.jpg")
+    if not place.exists():
+        write_image(place, drawn)
     said = "; ".join(dict.fromkeys(fault.said for fault in faults))
     better = ", ".join(dict.fromkeys(fault.remedy for fault in faults))
     shown = f"{place} shows what was tracked"

@@ -113,12 +113,23 @@ def test_of_a_sound_video_nothing_is_said(
     tmp_path: Path, sound: VideoSource, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert faults(sound) == []
-    # A sheet of an earlier call would be of another video.
-    (tmp_path / "capture_tracked.jpg").touch()
     capsys.readouterr()
     say_faults(sound, tmp_path / "capture", VideoImport(strict=True))
     assert capsys.readouterr().err == ""
-    assert not (tmp_path / "capture_tracked.jpg").exists()
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_file_of_the_user_next_to_the_capture_stays(
+    tmp_path: Path, sound: VideoSource, clip: SyntheticClip
+) -> None:
+    own = tmp_path / "capture_tracked.jpg"
+    own.write_text("mine")
+    dark = spoilt(sound, clip, darkened, FRAMES)
+    # The sheet of a sound video is none, and the same video has the same sheet again.
+    for source in (sound, dark, dark):
+        say_faults(source, tmp_path / "capture", VideoImport())
+        assert own.read_text() == "mine"
+    assert len(list(tmp_path.iterdir())) == 2
 
 
 def test_the_folder_that_one_is_in_has_a_name(
@@ -127,7 +138,7 @@ def test_the_folder_that_one_is_in_has_a_name(
     (tmp_path / "mine").mkdir()
     monkeypatch.chdir(tmp_path / "mine")
     say_faults(spoilt(sound, clip, darkened, FRAMES), ".", VideoImport())
-    assert (tmp_path / "mine_tracked.jpg").is_file()
+    assert len(list(tmp_path.glob("mine_tracked_*.jpg"))) == 1
 
 
 SPOILT = [
@@ -197,12 +208,12 @@ def test_one_message_with_a_sheet_comes_before_the_import(
     video = write_video(tmp_path / "hand.avi", [picture // 16 for picture, _ in pairs])
     landmarks = replace(clip.landmarks, image=np.stack([points for _, points in pairs]))
     tracked = write_landmarks(tmp_path / "hand.npz", landmarks)
-    sheet = tmp_path / "capture_tracked.jpg"
     with pytest.raises(BadInput) as caught:
         import_video(video, tracked, tmp_path / "capture", VideoImport(strict=True))
     message = str(caught.value)
     assert "cut off in 10 of 10 frames; the right hand is underexposed in 10" in message
     assert "Keep all of the hand in the picture, film with more light" in message
+    [sheet] = tmp_path.glob("capture_tracked_*.jpg")
     assert str(sheet) in message
     assert cv2.imread(str(sheet)).shape[1] > 4 * 256
     assert not (tmp_path / "capture").exists()
