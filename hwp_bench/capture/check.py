@@ -154,7 +154,7 @@ def _facts(capture: Capture, clip: Capture | None) -> dict[str, Any]:
     truth = {
         "clean frames": capture.has_clean,
         "exact masks": capture.has_true_masks,
-        "hand parameters": capture.true_hands is not None,
+        "hand parameters": (capture.root / TRUE_HANDS).is_file(),
     }
     return {
         "id": info.id,

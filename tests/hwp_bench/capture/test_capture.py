@@ -264,8 +264,9 @@ def test_damaged_numbers_are_named(make_capture: CaptureMaker, tmp_path: Path) -
         Cameras(cameras(12, 32).Ks, viewmats)
 
 
-def test_the_check_names_damaged_images_and_strangers(make_capture: CaptureMaker) -> None:
-    root = make_capture(frames=12).root
+def test_the_check_names_damaged_files_and_strangers(make_capture: CaptureMaker) -> None:
+    root = make_capture(frames=12, truth=True).root
+    (root / "truth" / "hands.npz").write_bytes(b"x")
     (root / "frames" / "000004.png").write_bytes(b"")
     (root / "masks" / "000002.png").unlink()
     (root / "frames" / "notes.txt").write_text("x")
@@ -275,6 +276,7 @@ def test_the_check_names_damaged_images_and_strangers(make_capture: CaptureMaker
     assert problems["000004.png"] == "is empty (0 bytes)"
     assert problems["000002.png"] == "does not exist"
     assert problems["frames"] == "holds 1 further files: notes.txt"
+    assert problems["hands.npz"].startswith("is not ")
 
 
 def test_a_hand_behind_the_camera_and_an_empty_mask_are_found(
