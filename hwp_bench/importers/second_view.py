@@ -39,6 +39,8 @@ KIND = "second camera"
 #: A clip is refused where the hands of one camera miss those of the other by more than this share
 #: of their size: another calibration, another offset, other hands.
 FAILED = 0.15
+# Largest difference of two frame rates that are taken for one, as a share.
+_SAME_RATE = 0.01
 # Distance from which on landmarks that disagree pull less, px; most steps: sound pairs take ten.
 _ROBUST, _STEPS = 2.0, 50
 
@@ -136,6 +138,14 @@ def add_second_view(
         if values[0] != values[1]:
             said = f"{name} is {values[1]}, of {first.root} {values[0]}"
             raise UsageError(said, where=second.root, remedy="Import both with the same choices.")
+    rates = [_rate(capture) for capture in (first, second)]
+    if abs(rates[0] - rates[1]) > _SAME_RATE * max(rates):
+        raise UsageError(
+            f"has {rates[1]:.4g} frames per second, {first.root} {rates[0]:.4g}",
+            where=second.root,
+            remedy="Frames are paired by their numbers: convert one video to the rate of the "
+            "other, track and import it again.",
+        )
     offset = 0 if calibration is None else calibration.offset
     rows, others = _common_frames(first, second, offset)
     hands, cameras = _hands_of(first, rows), _cameras_of(second, others)
@@ -240,6 +250,12 @@ def _times(capture: Capture) -> list[int]:
     if not isinstance(frames, list) or len(frames) != len(capture):
         return list(range(len(capture)))
     return frames if all(isinstance(one, int) for one in frames) else list(range(len(frames)))
+
+
+def _rate(capture: Capture) -> float:
+    """Frames per second of its whole video or data set, on average."""
+    numbers, times = _times(capture), capture.info.frame_times()
+    return (numbers[-1] - numbers[0]) / times[-1] if len(times) > 1 else capture.info.fps
 
 
 def _cropped(capture: Capture, rows: np.ndarray, K: list[list[float]]) -> np.ndarray:

@@ -182,9 +182,10 @@ def test_what_contradicts_the_calibration_is_refused(pair: Pair, tmp_path: Path)
     assert (made.frames[0], made.second_frames[0]) == (0, 10)
     # A capture that was not cropped from a video has no whole frames to calibrate.
     other = imported(tmp_path / "other", front.hands["right"], FIRST, 10)
-    bare = replace(other, info=replace(other.info, source={}))
+    numbered = {"frames": other.info.source["frames"]}
+    bare = replace(other, info=replace(other.info, source=numbered))
     with pytest.raises(UsageError, match="how its frames were cropped"):
-        add_second_view(front, bare, calibration(offset=-10), overwrite=True)
+        add_second_view(front, bare, calibration(offset=0), overwrite=True)
 
 
 def test_captures_of_videos_need_a_calibration(pair: Pair) -> None:
@@ -193,6 +194,17 @@ def test_captures_of_videos_need_a_calibration(pair: Pair) -> None:
     with pytest.raises(UsageError, match="--calibration: captures of videos share no world"):
         add_second_view(front, front)
     assert front.free_view is None
+
+
+def test_cameras_of_different_rates_are_refused(pair: Pair) -> None:
+    """Frames are paired by their numbers; every second one is taken here of about 28 a second."""
+    front, side = pair()
+    times = tuple(1.2 * time for time in side.info.frame_times())
+    slow = replace(side, info=replace(side.info, times=times))
+    with pytest.raises(UsageError, match=r"side: has 23\.\d+ frames per second, .*front 28\.\d"):
+        add_second_view(front, slow, calibration())
+    even = replace(side, info=replace(side.info, times=None, fps=14.15))
+    add_second_view(front, even, calibration())
 
 
 def text(**changes: str) -> str:
