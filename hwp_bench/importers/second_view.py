@@ -133,6 +133,12 @@ def add_second_view(
             field="--calibration",
             remedy="Say where both cameras are with --calibration; docs/video.md describes it.",
         )
+    if _pictures(first) & _pictures(second):
+        raise UsageError(
+            f"shows the pictures of {first.root}",
+            where=second.root,
+            remedy="Name a capture of another camera.",
+        )
     for name in ("hands", "width", "height"):
         values = [getattr(capture.info, name) for capture in (first, second)]
         if values[0] != values[1]:
@@ -250,6 +256,13 @@ def _times(capture: Capture) -> list[int]:
     if not isinstance(frames, list) or len(frames) != len(capture):
         return list(range(len(capture)))
     return frames if all(isinstance(one, int) for one in frames) else list(range(len(frames)))
+
+
+def _pictures(capture: Capture) -> set[str]:
+    """Digests of its frames, and of its video where it is of one."""
+    video, frames = capture.info.source.get("video"), (capture.info.digests or {}).get("frames")
+    known = [frames, video.get("sha256") if isinstance(video, dict) else None]
+    return {str(digest) for digest in known if digest}
 
 
 def _rate(capture: Capture) -> float:

@@ -86,7 +86,7 @@ def imported(path: Path, hand: HandParameters, K: np.ndarray, start: int) -> Cap
     )
     with CaptureWriter(path, info, {"right": hand}, cameras) as writer:
         for frame in range(COUNT):
-            writer.frame(frame, np.full((SIZE, SIZE, 3), 10 * frame, np.uint8))
+            writer.frame(frame, np.full((SIZE, SIZE, 3), (10 * frame, start, 0), np.uint8))
             writer.mask(frame, np.full((SIZE, SIZE), 255, np.uint8))
     return open_capture(path)
 
@@ -181,11 +181,11 @@ def test_what_contradicts_the_calibration_is_refused(pair: Pair, tmp_path: Path)
     assert open_capture(front.root).free_view.info.times is None
     assert (made.frames[0], made.second_frames[0]) == (0, 10)
     # A capture that was not cropped from a video has no whole frames to calibrate.
-    other = imported(tmp_path / "other", front.hands["right"], FIRST, 10)
+    other = imported(tmp_path / "other", front.hands["right"], FIRST, 11)
     numbered = {"frames": other.info.source["frames"]}
     bare = replace(other, info=replace(other.info, source=numbered))
     with pytest.raises(UsageError, match="how its frames were cropped"):
-        add_second_view(front, bare, calibration(offset=0), overwrite=True)
+        add_second_view(front, bare, calibration(offset=1), overwrite=True)
 
 
 def test_captures_of_videos_need_a_calibration(pair: Pair) -> None:
@@ -205,6 +205,20 @@ def test_cameras_of_different_rates_are_refused(pair: Pair) -> None:
         add_second_view(front, slow, calibration())
     even = replace(side, info=replace(side.info, times=None, fps=14.15))
     add_second_view(front, even, calibration())
+
+
+def test_a_capture_is_not_its_own_second_camera(pair: Pair, tmp_path: Path) -> None:
+    front, side = pair()
+    again = imported(tmp_path / "again", front.hands["right"], FIRST, 10)
+    infos = [
+        replace(one.info, source={**one.info.source, "video": {"sha256": "1" * 64}})
+        for one in (front, side)
+    ]
+    of_one = replace(front, info=infos[0]), replace(side, info=infos[1])
+    for two in ((front, again), of_one):
+        with pytest.raises(UsageError, match=r"shows the pictures of .*front\. Name a capture of"):
+            add_second_view(*two, calibration(offset=0))
+    assert front.free_view is None
 
 
 def text(**changes: str) -> str:
