@@ -356,15 +356,14 @@ def contact_sheet(capture: Capture, *, count: int = 24, edge: int = 256) -> np.n
     """
     import torch
 
-    from hwp_bench.hands import load_template, project
+    from hwp_bench.hands import project
     from hwp_bench.hands.skinning import pose_parameters
 
     chosen = evenly(len(capture), count).tolist()
     cameras = (capture.cameras.viewmats[chosen], capture.cameras.Ks[chosen])
     pixels: dict[str, np.ndarray] = {}
     for side, hand in capture.hands.items():
-        template = load_template(capture.info.hand_model.source, side)
-        landmarks = pose_parameters(template, hand, chosen).landmarks
+        landmarks = pose_parameters(capture.template(side), hand, chosen).landmarks
         pixels[side] = project(landmarks, *map(torch.from_numpy, cameras))[0].numpy()
     tiles = []
     for row, frame in enumerate(chosen):

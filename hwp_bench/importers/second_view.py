@@ -25,7 +25,7 @@ from hwp_bench.base.files import refuse_existing
 from hwp_bench.base.records import parse_record, parse_toml, without_schema
 from hwp_bench.capture import Cameras, Capture, CaptureWriter
 from hwp_bench.capture.schema import FREE_VIEW, MAX_FRAMES, MAX_ID, check_cameras
-from hwp_bench.hands import HandParameters, load_template, project
+from hwp_bench.hands import HandParameters, project
 from hwp_bench.hands.skinning import pose_parameters
 from hwp_bench.importers.shared.frames import CropWindows
 from hwp_bench.metrics.pixels import can_be_scored
@@ -216,8 +216,7 @@ def _cameras_of(capture: Capture, rows: np.ndarray) -> Cameras:
 
 def _landmarks(capture: Capture, hands: Mapping[str, HandParameters]) -> torch.Tensor:
     """Landmarks of the hands of a capture in the world, (F, 21 or 42, 3) m."""
-    source = capture.info.hand_model.source
-    posed = [pose_parameters(load_template(source, side), hand) for side, hand in hands.items()]
+    posed = [pose_parameters(capture.template(side), hand) for side, hand in hands.items()]
     return torch.cat([one.landmarks for one in posed], dim=1)
 
 

@@ -456,3 +456,8 @@ def test_the_contact_sheet_draws_each_frame_with_its_own_mask_and_hands(
         left = GAP + place * (edge + GAP)
         tile = page[GAP + LABEL_HEIGHT :][:edge, left : left + edge]
         assert (tile != expected).any(axis=2).mean() < 0.01
+    # Hands of another edition of the model would be drawn elsewhere.
+    model = replace(capture.info.hand_model, digest="0" * 64)
+    other = replace(capture, info=replace(capture.info, hand_model=model))
+    with pytest.raises(BadInput, match="belongs to another edition of hand model"):
+        contact_sheet(other, count=6, edge=edge)

@@ -180,6 +180,10 @@ def test_what_contradicts_the_calibration_is_refused(pair: Pair, tmp_path: Path)
     # Fewer frames than the capture, whose times are not the clip's.
     assert open_capture(front.root).free_view.info.times is None
     assert (made.frames[0], made.second_frames[0]) == (0, 10)
+    model = replace(side.info.hand_model, digest="0" * 64)
+    edition = replace(side, info=replace(side.info, hand_model=model))
+    with pytest.raises(BadInput, match="belongs to another edition of hand model"):
+        add_second_view(front, edition, calibration(), overwrite=True)
     # A capture that was not cropped from a video has no whole frames to calibrate.
     other = imported(tmp_path / "other", front.hands["right"], FIRST, 11)
     numbered = {"frames": other.info.source["frames"]}
