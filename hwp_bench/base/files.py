@@ -368,7 +368,7 @@ def read_json(path: str | os.PathLike[str], *, max_bytes: int = MAX_JSON_BYTES) 
     """Read a JSON file from outside."""
     path = Path(path)
     try:
-        text = _read_bounded(path, max_bytes).decode()
+        text = read_bounded(path, max_bytes).decode()
         value = json.loads(
             text,
             parse_constant=_finite,
@@ -403,7 +403,8 @@ def read_json(path: str | os.PathLike[str], *, max_bytes: int = MAX_JSON_BYTES) 
     return value
 
 
-def _read_bounded(path: Path, max_bytes: int) -> bytes:
+def read_bounded(path: Path, max_bytes: int) -> bytes:
+    """Read a regular file from outside that holds at most so many bytes."""
     # Non-blocking: a named pipe would keep its reader waiting forever. The size of a device or a
     # growing file does not say how much can be read from it.
     handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))

@@ -21,7 +21,7 @@ from msgspec import Meta
 
 from hwp_bench.base.arrays import evenly
 from hwp_bench.base.errors import BadInput, UsageError
-from hwp_bench.base.files import refuse_existing
+from hwp_bench.base.files import read_bounded, refuse_existing
 from hwp_bench.base.records import parse_record, parse_toml, without_schema
 from hwp_bench.capture import Cameras, Capture, CaptureWriter
 from hwp_bench.capture.schema import FREE_VIEW, MAX_FRAMES, MAX_ID, check_cameras
@@ -68,7 +68,7 @@ def read_calibration(path: Path) -> TwoCameras:
         BadInput: a field is missing or wrong, or a matrix is not a camera's.
     """
     try:
-        text = path.open(encoding="utf-8").read(MAX_BYTES)
+        text = read_bounded(path, MAX_BYTES).decode()
     except (OSError, UnicodeDecodeError) as error:
         raise BadInput("cannot be read", where=path) from error
     value = without_schema(parse_toml(text, where=path), SCHEMA, where=path)

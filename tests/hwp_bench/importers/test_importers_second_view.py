@@ -28,7 +28,12 @@ from hwp_bench.capture.schema import image_path
 from hwp_bench.cli.main import main
 from hwp_bench.hands import HandParameters, load_template
 from hwp_bench.hands.skinning import pose_parameters
-from hwp_bench.importers.second_view import TwoCameras, add_second_view, read_calibration
+from hwp_bench.importers.second_view import (
+    MAX_BYTES,
+    TwoCameras,
+    add_second_view,
+    read_calibration,
+)
 from hwp_bench.importers.shared.frames import CropWindows
 
 COUNT, SIZE, SIDE, OFFSET = 16, 64, 200, 3
@@ -257,6 +262,9 @@ def test_a_calibration_is_read_and_checked(tmp_path: Path) -> None:
             read_calibration(path)
     with pytest.raises(BadInput, match="cannot be read"):
         read_calibration(tmp_path / "none.toml")
+    path.write_text(text() + "\n" * MAX_BYTES)
+    with pytest.raises(BadInput, match=f"more than the {MAX_BYTES} bytes"):
+        read_calibration(path)
 
 
 def test_another_camera_of_interhand_becomes_the_clip(tmp_path: Path, capsys) -> None:
