@@ -254,6 +254,9 @@ def _box(row: Mapping[str, Any], pickle: Path, number: int) -> np.ndarray | None
 def _side(rows: Rows, side: str) -> SideRecords:
     arrays = {key: _stack(rows, f"{key}_{side}", shape) for key, shape in SIDE_KEYS.items()}
     flat = [array.reshape(len(rows), -1) for array in arrays.values()]
+    if side == "left":
+        # The tracker places the left hand by it.
+        flat.append(_stack(rows, "root_rel", (3,)))
     return SideRecords(
         pose=arrays["mano_pose"].reshape(-1, 16, 3),
         shape=arrays["mano_shape"],

@@ -225,6 +225,18 @@ def test_compat_swaps_the_translations(
     assert compat.info.source["import"]["official_compat"]
 
 
+def test_a_left_hand_without_its_place_is_not_valid(tmp_path: Path, right: HandTemplate) -> None:
+    def change(rows: list) -> list:
+        rows[1]["root_rel"] = np.full((1, 3), np.nan)
+        return rows
+
+    folder = find_folders(records_with(tmp_path, right, change))[0]
+    import_official(folder, tmp_path / "c", OfficialImport())
+    hands = open_capture(tmp_path / "c").hands
+    assert hands["left"].valid.tolist() == [True, False, True]
+    assert hands["right"].valid.all()
+
+
 def test_without_mano_the_free_hand_is_fitted(release: Path, tmp_path: Path, capsys) -> None:
     out = tmp_path / "free"
     words = ["data", "import", "wildghand", str(release / "capture4_subsample4"), "-o", str(out)]
