@@ -499,13 +499,22 @@ def _import_hand(
     `centres` are (F, 2) px, half the frames' sizes.
     """
     hand = records.sides[side]
-    other = records.sides.get("left" if side == "right" else "right")
+    opposite = "left" if side == "right" else "right"
+    other = records.sides.get(opposite)
     if options.official_compat and other is not None:
         # The released loader lists pose and shape as (right, left) and the translations as (left,
         # right): its network gets a hand with the other one's. Where the tracker gives both hands
         # one translation, which it mostly does, nothing changes.
         moved = hand.vertices - hand.camera[:, None] + other.camera[:, None]
         both = hand.valid & other.valid
+        if not both.any():
+            raise BadInput(
+                f"no frame has a finite {side} and {opposite} hand, and the released loader gives "
+                "each the other's translation",
+                where=folder.path,
+                field=f"cam_aligned_{opposite}",
+                remedy="Import it without --official-compat.",
+            )
         hand = replace(hand, vertices=moved, camera=other.camera, valid=both)
     template = load_template(options.model, side)
     if options.mano is not None:

@@ -237,6 +237,23 @@ def test_a_left_hand_without_its_place_is_not_valid(tmp_path: Path, right: HandT
     assert hands["right"].valid.all()
 
 
+def test_compat_needs_the_translation_of_the_hand_that_is_not_shown(
+    tmp_path: Path, right: HandTemplate, mano: Path
+) -> None:
+    place = tmp_path / "capture0_subsample3_single"
+    rows = write_release(place, right, 3, sides=("right",))
+    [folder], choices = find_folders(place), OfficialImport(mano=mano, official_compat=True)
+    import_official(folder, tmp_path / "a", choices)
+    import_official(folder, tmp_path / "b", OfficialImport(mano=mano))
+    moved, own = (open_capture(tmp_path / name).hands["right"].transl for name in "ab")
+    np.testing.assert_allclose(moved - own, np.tile([0.004, 0.0, 0.05], (3, 1)), atol=1e-9)
+    for row in rows:
+        row["cam_aligned_left"] = np.full((1, 3), np.nan)
+    write_pickles(place, rows)
+    with pytest.raises(BadInput, match="cam_aligned_left: no frame has a finite right and left"):
+        import_official(folder, tmp_path / "c", choices)
+
+
 def test_without_mano_the_free_hand_is_fitted(release: Path, tmp_path: Path, capsys) -> None:
     out = tmp_path / "free"
     words = ["data", "import", "wildghand", str(release / "capture4_subsample4"), "-o", str(out)]
