@@ -423,6 +423,7 @@ def import_interhand(
     cameras = Cameras(windows.intrinsics(records.K), viewmats)
     clips = projected(cameras.Ks)
     facts |= {"errors": errors, "crop_px": windows.side, "split": records.split}
+    fps, times = _timing(records, options.fps)
     write_capture(
         out,
         hands,
@@ -436,7 +437,8 @@ def import_interhand(
         id=sequence.id,
         action=sequence.name,
         device=f"InterHand2.6M camera {sequence.camera}",
-        fps=options.fps,
+        fps=fps,
+        times=times,
         perturbations={},
         source={
             "kind": "InterHand2.6M",
@@ -449,6 +451,18 @@ def import_interhand(
         licence=LICENCE,
     )
     return facts
+
+
+def _timing(records: InterHandRecords, fps: float) -> tuple[float, tuple[float, ...] | None]:
+    """Mean rate of the frames, and their times where steps differ, as next to black frames.
+
+    The usual step between the numbers of annotated frames is one of `fps` in a second.
+    """
+    usual = np.median(np.diff(np.sort([*records.frames, *records.black])))
+    places = (records.frames - records.frames[0]) / usual
+    rate, steps = fps * float((len(places) - 1) / places[-1]), np.diff(places)
+    even = bool((steps == steps[0]).all())
+    return rate, None if even else tuple(np.round(places / fps, 6).tolist())
 
 
 def _import_hand(

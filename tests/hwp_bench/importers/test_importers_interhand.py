@@ -59,6 +59,7 @@ def test_mano_hands_lie_on_the_images(
     capture = open_capture(tmp_path / "c")
     assert check_capture(capture.root).ok
     assert capture.info.source["frames"] == list(FRAMES)
+    assert (capture.info.fps, capture.info.times) == (5.0, None)
     assert capture.info.hands == "both"
     assert facts["errors"]["right"]["joints_mm"] < 0.01
     np.testing.assert_array_equal(capture.hands["left"].valid, np.arange(12) != 4)
@@ -174,6 +175,9 @@ def test_black_images_are_named_and_left_out(
     capture = open_capture(tmp_path / "c")
     assert capture.info.source["frames"] == kept
     assert capture.info.source["import"]["black_frames"] == [FRAMES[2], FRAMES[11]]
+    # Five frames a second, in the places that they have among all of them.
+    assert capture.info.times == (0.0, 0.2, 0.6, 0.8, 1.0, 1.2, 1.4, 1.6, 1.8, 2.0)
+    assert capture.info.fps == pytest.approx(4.5)
     # The frame in which the left hand is missing is one earlier.
     np.testing.assert_array_equal(capture.hands["left"].valid, np.arange(10) != 3)
     for frame in FRAMES[:10]:
