@@ -323,13 +323,16 @@ def _track(args: argparse.Namespace) -> int:
         return print_result(args.json, {"models": str(folder)}, [f"networks: {folder}"])
     if args.video is None:
         raise UsageError("VIDEO is missing", remedy="Give a video, or --fetch.")
+    least = args.min_score
+    if not 0 < least < 1:
+        remedy = "Use a number between 0 and 1."
+        raise UsageError(f"is {least}", field="--min-score", remedy=remedy)
     check_is_file(args.video, field="VIDEO")
     out = args.out or args.video.with_suffix(".npz")
     outputs = {"--out": out, "--sheet": args.sheet}
     check_places(outputs, {"VIDEO": args.video, "--model": args.model})
     if args.sheet is not None:
         check_sheet(args.sheet)
-    least = args.min_score
     tracked = track_video(
         args.video,
         out,

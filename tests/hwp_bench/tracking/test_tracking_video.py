@@ -156,7 +156,7 @@ def test_mistakes_are_one_line(
         (["data", "track", str(broken)], 1, "broken.avi"),
         (["data", "track", str(video), "-o", str(tmp_path / "x.txt")], 2, ".npz"),
         (["data", "track", str(video), "--model", str(broken)], 1, "not a readable archive"),
-        (["data", "track", str(video), "--min-score", "2"], 2, "between 0 and 1"),
+        (["data", "track", str(video), "--min-score", "2"], 2, "--min-score: is 2.0. Use"),
     ):
         assert main(arguments) == status, arguments
         said = capsys.readouterr().err
