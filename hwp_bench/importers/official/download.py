@@ -119,7 +119,8 @@ def download_release(
         raise UsageError("no file of the release matches", field="--capture")
     targets = {item.name: inside(folder, item.name) for item in chosen}
     path = pins or cache_root() / "pins" / f"{REPOSITORY.replace('/', '--')}@{commit}.json"
-    pinned: dict[str, str] = read_json(path)["files"] if path.is_file() else {}
+    again = "Move it away and run the command again, which pins the checksums that it finds."
+    pinned: dict[str, str] = _read(path, again)["files"] if path.is_file() else {}
     folder.mkdir(parents=True, exist_ok=True)
     header = {"schema": SCHEMA, "repository": REPOSITORY, "revision": revision, "commit": commit}
     if record is None:
@@ -146,11 +147,7 @@ def download_release(
 
 def _record(folder: Path) -> dict[str, Any] | None:
     if (folder / RECORD).is_file():
-        value = read_json(folder / RECORD)
-        good = isinstance(value, dict) and value.get("schema") == SCHEMA
-        if good and isinstance(value.get("commit"), str) and isinstance(value.get("files"), dict):
-            return {"revision": None, **value}
-        raise BadInput("is not the record of a download", where=folder / RECORD)
+        return {"revision": None, **_read(folder / RECORD)}
     if folder.exists() and (folder.is_file() or any(folder.iterdir())):
         raise UsageError(
             "exists already and was not made by this command",
@@ -158,6 +155,16 @@ def _record(folder: Path) -> dict[str, Any] | None:
             remedy="Choose an empty folder.",
         )
     return None
+
+
+def _read(path: Path, remedy: str | None = None) -> dict[str, Any]:
+    """Read a record or pins, which have the same fields."""
+    value = read_json(path)
+    good = isinstance(value, dict) and value.get("schema") == SCHEMA
+    good = good and isinstance(value.get("commit"), str) and isinstance(value.get("files"), dict)
+    if not good or not all(isinstance(digest, str) for digest in value["files"].values()):
+        raise BadInput("is not the record of a download", where=path, remedy=remedy)
+    return dict(value)
 
 
 def _verified(item: RemoteFile, target: Path, pinned: str | None) -> str:

@@ -104,6 +104,20 @@ def test_what_the_hub_states_must_hold(tmp_path: Path, pins: Path) -> None:
     assert not pins.exists()
 
 
+@pytest.mark.parametrize("change", [{"files": {"README.md": 1}}, {"files": None}, {"schema": "?"}])
+def test_damaged_pins_and_records_are_named(
+    tmp_path: Path, pins: Path, change: dict[str, Any]
+) -> None:
+    download_release(tmp_path / "out", MemoryHub(FILES), pins=pins)
+    for file, folder in (pins, "new"), (tmp_path / "out" / RECORD, "out"):
+        content = file.read_text()
+        file.write_text(json.dumps({**json.loads(content), **change}))
+        with pytest.raises(BadInput, match=f"{file.name}: is not the record of a download"):
+            download_release(tmp_path / folder, MemoryHub(FILES), pins=pins)
+        file.write_text(content)
+    assert not (tmp_path / "new").exists()
+
+
 def test_a_folder_of_the_user_is_not_touched(tmp_path: Path, pins: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "thesis.tex").write_text("x")
