@@ -271,6 +271,27 @@ def pixel_digest(pixels: np.ndarray) -> str:
     return hashlib.sha256(head + np.ascontiguousarray(pixels).tobytes()).hexdigest()
 
 
+def sample(
+    image: np.ndarray, places: np.ndarray, how: int | None = None, border: int | None = None
+) -> np.ndarray:
+    """Read an image (H, W) or (H, W, C) at (P, 2) px, pixel centres at +0.5; C at most 4.
+
+    `how` and `border` are OpenCV's; by default it is bilinear, and zero outside of the image.
+    """
+    import cv2
+
+    padded = np.zeros((-(-max(len(places), 1) // _ROW) * _ROW, 2), np.float32)
+    padded[: len(places)] = places - 0.5
+    x, y = (np.ascontiguousarray(part.reshape(-1, _ROW)) for part in padded.T)
+    how = cv2.INTER_LINEAR if how is None else how
+    border = cv2.BORDER_CONSTANT if border is None else border
+    found = cv2.remap(image, x, y, how, borderMode=border)
+    return np.asarray(found.reshape(-1, *image.shape[2:])[: len(places)])
+
+
+# OpenCV takes at most 32,767 places in a row.
+_ROW = 1024
+
 #: Encoder, in FFmpeg's naming.
 ENCODER = "libx264"
 #: Constant quality of x264: 0 is lossless, 18 hardly differs from the frames.

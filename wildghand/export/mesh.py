@@ -17,6 +17,7 @@ import torch
 from scipy import ndimage
 
 from hwp_bench.base.errors import UsageError
+from hwp_bench.base.images import sample
 from hwp_bench.base.numerics import kd_tree
 from hwp_bench.base.rays import ray_mesh
 from hwp_bench.capture import Capture
@@ -165,15 +166,7 @@ def _in_sight(vertices: np.ndarray, faces: np.ndarray, places: np.ndarray) -> np
 def _read(rgba: np.ndarray, camera: Camera, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Colour (M, 3) and coverage (M,) of a picture at places in front of its camera."""
     pixel = places @ camera.K.T
-    # OpenCV counts from the middle of the first pixel.
-    pixel = (pixel[:, :2] / pixel[:, 2:] - 0.5).astype(np.float32)
-    # OpenCV takes no table with a side above 32,767, and none without a row.
-    width = 1024
-    table = np.zeros((len(pixel) // width + 1, width, 2), dtype=np.float32)
-    table.reshape(-1, 2)[: len(pixel)] = pixel
-    across, down = (np.ascontiguousarray(table[..., axis]) for axis in range(2))
-    read = cv2.remap(rgba, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-    read = read.reshape(-1, 4)[: len(pixel)]
+    read = sample(rgba, pixel[:, :2] / pixel[:, 2:])
     covered = read[:, 3]
     return read[:, :3] / np.maximum(covered, 1e-6)[:, None], covered
 

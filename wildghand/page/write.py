@@ -18,6 +18,7 @@ import torch
 from hwp_bench.base.arrays import evenly
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import atomic_write, refuse_existing_file
+from hwp_bench.base.images import sample
 from hwp_bench.capture import Capture
 from hwp_bench.hands import anatomical_limits, load_template, pose_from_joint_angles
 from hwp_bench.methods.contract import Camera, HandPose
@@ -242,8 +243,8 @@ def mean_weights(
         for side, (pixels, facing) in shown.items():
             # Masks have the size of the frame, unless a person has made them smaller.
             scale = np.array(mask.shape[::-1]) / (camera.width, camera.height)
-            x, y = (pixels[0].cpu().numpy() * scale - 0.5).astype(np.float32).T
-            weight = cv2.remap(mask, x[None], y[None], cv2.INTER_LINEAR)[0] / 255.0
+            places = pixels[0].cpu().numpy() * scale
+            weight = sample(mask, places) / 255.0
             counts = (facing[0] > 0.0).cpu().numpy()
             sums[side] += counts * np.stack([weight, np.ones_like(weight)])
     if not masks:

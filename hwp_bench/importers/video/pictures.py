@@ -18,6 +18,7 @@ import torch
 
 from hwp_bench.base.arrays import surrounding
 from hwp_bench.base.colors import COUNT, harmonics
+from hwp_bench.base.images import sample
 from hwp_bench.base.kernels import compiled
 from hwp_bench.hands import HandTemplate
 from hwp_bench.hands.raster import draw_faces, mix_corners
@@ -35,31 +36,12 @@ from hwp_bench.importers.video.model import (
 _MARGIN = 1.5
 # Px, deviation of a Gaussian that is still well taken from pixels.
 _FINE = 2.5
-# OpenCV takes at most 32,767 places in a row.
-_ROW = 1024
 
 
 def row_products(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """The (P,) scalar products of the rows of (P, C) and (P, C), for small C."""
     # NumPy's sum over a short last axis takes several times as long.
     return np.asarray((first * second) @ np.ones(first.shape[1], first.dtype))
-
-
-def sample(
-    image: np.ndarray,
-    places: np.ndarray,
-    how: int = cv2.INTER_LINEAR,
-    border: int = cv2.BORDER_CONSTANT,
-) -> np.ndarray:
-    """Read an image (H, W) or (H, W, C) float32 at (P, 2) px, pixel centres at +0.5; C at most 4.
-
-    `how` and `border` are OpenCV's; outside of the image it is zero by default.
-    """
-    padded = np.zeros((-(-max(len(places), 1) // _ROW) * _ROW, 2), np.float32)
-    padded[: len(places)] = places - 0.5
-    x, y = (np.ascontiguousarray(part.reshape(-1, _ROW)) for part in padded.T)
-    found = cv2.remap(image, x, y, how, borderMode=border)
-    return np.asarray(found.reshape(-1, *image.shape[2:])[: len(places)])
 
 
 def smooth_within(values: np.ndarray, region: np.ndarray, breadth: float) -> np.ndarray:

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import torch
 
+from hwp_bench.base.images import sample
 from hwp_bench.hands import HandTemplate
 from hwp_bench.hands.articulation import anatomical_limits, axis_angle_to_matrix
 from hwp_bench.hands.raster import draw_silhouette
@@ -22,7 +23,6 @@ from hwp_bench.hands.template import boundary_vertices
 from hwp_bench.importers.shared.frames import CropWindows, cells, each_frame
 from hwp_bench.importers.shared.landmarks import Landmarks
 from hwp_bench.importers.video.model import ClipModel, pose_vertices
-from hwp_bench.importers.video.pictures import sample
 
 # --- Landmarks, motion, and what is known of hands
 

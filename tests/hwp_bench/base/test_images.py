@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from browser import open_page
 from PIL import Image
+from scipy import ndimage
 
 from hwp_bench.base import images
 from hwp_bench.base.errors import BadImage, HwpError, MissingDependency, ShapeMismatch
@@ -21,6 +22,7 @@ from hwp_bench.base.images import (
     pixel_digest,
     read_gray,
     read_rgb,
+    sample,
     write_image,
     write_movie,
 )
@@ -233,6 +235,22 @@ def test_images_one_pixel_wide_and_of_4096_come_back(tmp_path: Path, size) -> No
     np.testing.assert_array_equal(read_rgb(tmp_path / "strided.png"), image[::-1])
     write_image(tmp_path / "mask.png", image[:, :, 0])
     np.testing.assert_array_equal(read_gray(tmp_path / "mask.png"), image[:, :, 0])
+
+
+def test_any_number_of_places_is_read() -> None:
+    """Oracle: SciPy's interpolation, to a 32nd of a pixel, which is the step of OpenCV's tables."""
+    rng = np.random.default_rng(0)
+    image = rng.random((20, 30, 3), dtype=np.float32)
+    for count in (0, 1, 1024, 40_000):
+        places = rng.uniform((1.0, 1.0), (29.0, 19.0), (count, 2))
+        expected = [
+            ndimage.map_coordinates(image[..., channel], (places - 0.5).T[::-1], order=1)
+            for channel in range(3)
+        ]
+        found = sample(image, places)
+        assert found.shape == (count, 3)
+        np.testing.assert_allclose(found, np.stack(expected, axis=-1), atol=1 / 32)
+    assert not sample(image, np.array([[-5.0, 3.0], [10.0, 40.0]])).any()
 
 
 FPS = 24

@@ -21,6 +21,7 @@ from painted_clip import (
     true_pixels,
 )
 
+from hwp_bench.base.images import sample
 from hwp_bench.hands.raster import draw_faces, mix_corners
 from hwp_bench.importers.video.model import ClipModel, SurfaceMotion, pose_vertices
 from hwp_bench.importers.video.pictures import (
@@ -31,7 +32,6 @@ from hwp_bench.importers.video.pictures import (
     SeenTexels,
     TextureResidual,
     linearize,
-    sample,
     smooth_within,
 )
 from hwp_bench.importers.video.residuals import OutlineResidual, signed_distance
