@@ -202,6 +202,9 @@ class Screen:
                 page.drafted = version
             else:
                 page.drafted = page.finished = version
+            # The others come first next time: while a motion plays, every page always waits.
+            if self._pages.pop(page.client.client_id, None) is not None:
+                self._pages[page.client.client_id] = page
 
 
 def _camera(camera: CameraHandle) -> PageCamera:
@@ -241,9 +244,9 @@ class Panel:
                 self._player = self._add_motion(view.motion.times)
         with gui.add_folder("pose"):
             self._add_poses()
-        for side in view.hands:
+        for side in view.angles:
             for folder, joints in _FOLDERS.items():
-                name = folder if len(view.hands) == 1 else f"{side} {folder}"
+                name = folder if len(view.angles) == 1 else f"{side} {folder}"
                 with gui.add_folder(name, expand_by_default=folder == "index"):
                     for joint in joints:
                         self._add_joint(side, joint)
@@ -287,8 +290,11 @@ class Panel:
             def moved(event: GuiEvent[Any], angle: int = angle) -> None:
                 # What this program sets has no client; the hands have it already.
                 if event.client is not None:
-                    self._pause()
-                    self._view.set_angle(side, joint, angle, event.target.value)
+                    degrees = event.target.value
+                    self._pause()  # It puts the sliders back.
+                    self._view.set_angle(side, joint, angle, degrees)
+                    if event.target.value != degrees:
+                        _put(event.target, degrees)
 
             slider.on_update(moved)
 
@@ -299,7 +305,7 @@ class Panel:
         def _(event: GuiEvent[Any]) -> None:
             if event.client is not None:
                 self._pause()
-                self._view.set_fingers(named.value)
+                self._view.set_fingers(event.target.value)
                 self.show_angles()
 
         @self._gui.add_button("upright at rest").on_click
@@ -333,8 +339,9 @@ class Panel:
         @frame.on_update
         def _(event: GuiEvent[Any]) -> None:
             if event.client is not None:
+                due = min(event.target.value, count - 1)  # Playback moves the slider.
                 self._pause()
-                view.set_frame(min(frame.value, count - 1))
+                view.set_frame(due)
                 self.show_angles()
 
         @speed.on_update

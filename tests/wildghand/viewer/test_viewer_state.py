@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from tiny_fits import TINY
 
+import wildghand
 from hwp_bench.base.errors import UsageError
 from hwp_bench.capture import Capture
 from hwp_bench.methods.contract import Camera
@@ -21,6 +26,7 @@ from wildghand.viewer.live import live_sheet
 from wildghand.viewer.posed_view import (
     Motion,
     PageCamera,
+    Picture,
     Player,
     PosedView,
     capture_of,
@@ -28,7 +34,7 @@ from wildghand.viewer.posed_view import (
     viewpoint,
 )
 from wildghand.viewer.server import refusal
-from wildghand.viewer.view import LEAST, MOST, TARGET, Pace
+from wildghand.viewer.view import LEAST, MOST, TARGET, Pace, Panel, Screen
 
 
 def psnr(first: np.ndarray, second: np.ndarray) -> float:
@@ -253,3 +259,117 @@ def test_the_motion_of_a_capture_is_that_of_the_hands_that_the_avatar_has(
     np.testing.assert_allclose(place.position, np.zeros(3), atol=1e-9)
     with pytest.raises(UsageError, match="shows the left hand"):
         Motion(tiny_avatar, make_painted("left"))
+
+
+class _Element:
+    """An element of a page: like viser's, it calls back when the program sets it, too."""
+
+    def __init__(self, value: Any = None) -> None:
+        self._value, self._called = value, lambda event: None
+
+    @property
+    def value(self) -> Any:
+        return self._value
+
+    @value.setter
+    def value(self, value: Any) -> None:
+        self._value = value
+        self._called(SimpleNamespace(client=None, target=self))
+
+    def on_update(self, call: Callable[[Any], None]) -> Callable[[Any], None]:
+        self._called = call
+        return call
+
+    on_click = on_update
+
+    def moved_to(self, value: Any) -> None:
+        """What a person does."""
+        self._value = value
+        self._called(SimpleNamespace(client=object(), target=self))
+
+
+class _Gui:
+    """The elements of a panel by folder and name."""
+
+    def __init__(self) -> None:
+        self.made: dict[str, _Element] = {}
+        self._folder = ""
+
+    @contextmanager
+    def add_folder(self, name: str, **_: Any) -> Iterator[None]:
+        self._folder = f"{name}/"
+        yield
+        self._folder = ""
+
+    def __getattr__(self, name: str) -> Callable[..., _Element]:
+        def add(label: str, *given: Any, initial_value: Any = None, **_: Any) -> _Element:
+            value = initial_value if initial_value is not None else next(iter(given), None)
+            return self.made.setdefault(self._folder + label, _Element(value))
+
+        return add
+
+
+def test_an_angle_that_is_changed_while_a_motion_plays_is_kept(
+    tiny_avatar: WildGHandAvatar, make_painted: Callable[..., Capture]
+) -> None:
+    gui, view = _Gui(), PosedView(tiny_avatar, Motion(tiny_avatar, make_painted()))
+    panel = Panel(gui, view, lambda place: None, (0, 0, 0))  # type: ignore[arg-type]
+    angles = view.angles["right"]
+    for playing in (True, False):
+        gui.made["motion/play"].value = playing
+        gui.made["index/index1 flexion"].moved_to(60.0 + playing)
+        assert not gui.made["motion/play"].value
+        assert gui.made["index/index1 flexion"].value == 60.0 + playing
+        assert angles.angles(view.hands["right"].pose)[1, 0] == pytest.approx(60.0 + playing)
+    panel.stop()
+
+
+def test_a_hand_that_the_capture_does_not_show_has_its_sliders_too(
+    make_painted: Callable[..., Capture],
+) -> None:
+    avatar = wildghand.fit(make_painted("both").root, settings={**TINY, "gaussians": 200}, steps=1)
+    gui, view = _Gui(), PosedView(avatar, Motion(avatar, make_painted("left")))
+    Panel(gui, view, lambda place: None, (0, 0, 0))  # type: ignore[arg-type]
+    assert set(view.hands) == {"left"}
+    slider, angles = gui.made["right index/index1 flexion"], view.angles["right"]
+    slider.moved_to(50.0)
+    assert set(view.hands) == {"left"}
+    gui.made["pose/upright at rest"].moved_to(None)
+    slider.moved_to(50.0)
+    assert angles.angles(view.hands["right"].pose)[1, 0] == pytest.approx(50.0)
+
+
+def test_pages_take_turns_while_something_moves() -> None:
+    """Oracle: each gets every second picture, when both always wait for one."""
+    arrive: list[Callable[[Any], None]] = []
+    server = SimpleNamespace(
+        on_client_connect=arrive.append, on_client_disconnect=lambda call: None
+    )
+    drawn: list[int] = []
+    enough = threading.Event()
+
+    def client(number: int) -> Any:
+        def shown(image: np.ndarray, **_: Any) -> None:
+            drawn.append(number)
+            screen.touch()
+            if len(drawn) >= 20:
+                enough.set()
+
+        camera = SimpleNamespace(
+            wxyz=np.array([1.0, 0.0, 0.0, 0.0]),
+            position=np.zeros(3),
+            fov=1.0,
+            image_width=64,
+            image_height=64,
+            on_update=lambda call: call,
+        )
+        scene = SimpleNamespace(set_background_image=shown)
+        return SimpleNamespace(client_id=number, camera=camera, scene=scene)
+
+    picture = Picture(np.zeros((64, 64, 3), np.uint8), True, TARGET, 0.0)
+    screen = Screen(server, lambda camera, draft: picture, 64)  # type: ignore[arg-type]
+    for number in (1, 2):
+        arrive[0](client(number))
+    assert enough.wait(60.0)
+    screen.stop()
+    assert drawn.count(2) >= 8
