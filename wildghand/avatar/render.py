@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +16,9 @@ from hwp_bench.base.console import track
 from hwp_bench.base.drawing import labelled, sheet
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import atomic_folder, check_places, refuse_existing_file, refuse_other
-from hwp_bench.base.images import as_uint8, check_encoder, write_image, write_movie
+from hwp_bench.base.images import as_uint8, check_encoder, read_rgb, write_image, write_movie
 from hwp_bench.capture import Capture
+from hwp_bench.methods.contract import HandPose
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.gaussians.training import TrainingClip
 from wildghand.model.frames import largest
@@ -37,22 +38,20 @@ def render_clip(
     """Draw frames into a folder, whole or not at all; `overwrite` replaces it and the video."""
     refuse_other(out, "frames", _holds_frames)
     check_places({"out": out, "video": video}, {"poses": capture.root}, replaces=overwrite)
-    sides = shown_sides(avatar, capture)
+    shown_sides(avatar, capture)  # refuses a capture of other hands
     if video is not None:
         refuse_existing_file(video, overwrite=overwrite, field="--video")
         check_encoder()
-    seconds, images = 0.0, []
+    seconds = 0.0
     with atomic_folder(out, overwrite=overwrite, flag="--overwrite") as folder:
         for frame in track(frames, "Drawing"):
-            poses, camera = capture.hand_poses(frame), capture.camera(frame)
+            hands, camera = hands_of(avatar, capture, frame), capture.camera(frame)
             started = time.perf_counter()
-            rgba = avatar.render({side: poses[side] for side in sides}, camera)
+            rgba = avatar.render(hands, camera)
             seconds += time.perf_counter() - started
             behind = (1.0 - rgba[..., 3:]) * (background / 255.0)
             image = np.rint(255.0 * (rgba[..., :3] + behind)).clip(0, 255).astype(np.uint8)
             write_image(folder / f"{frame:06d}.png", image)
-            if video is not None:
-                images.append(image)
         if video is not None:
             # Within the block: where the video cannot be written, no folder refuses the next start.
             times = None
@@ -60,6 +59,7 @@ def render_clip(
                 times = [
                     capture.info.times[frame] - capture.info.times[frames[0]] for frame in frames
                 ]
+            images = (read_rgb(folder / f"{frame:06d}.png") for frame in frames)
             write_movie(video, images, capture.info.fps, times)
     return {"frames": len(frames), "frames_per_second": len(frames) / max(seconds, 1e-9)}
 
@@ -85,6 +85,16 @@ def shown_sides(avatar: WildGHandAvatar, capture: Capture) -> list[str]:
             remedy="Convert them with `hwp-bench data convert`.",
         )
     return sides
+
+
+def hands_of(avatar: WildGHandAvatar, capture: Capture, frame: int) -> dict[str, HandPose]:
+    """Return the hands of a frame that an avatar has, in its corrected poses and with its shape.
+
+    The shape of a capture may be another person's.
+    """
+    shown = capture.hand_poses(frame)
+    hands = avatar.believed({side: shown[side] for side in shown_sides(avatar, capture)})
+    return {side: replace(hand, betas=avatar.betas[side]) for side, hand in hands.items()}
 
 
 #: How much a difference of colours is stretched around grey in a picture.
@@ -126,7 +136,7 @@ def explain_frames(
         origin = str(avatar.record.source.get("capture"))[:100]
         problem = f"was fitted to {origin!r}, not to this import of {capture.info.id!r}"
         raise UsageError(problem, field="avatar")
-    rows = torch.arange(len(fitted))
+    rows = torch.arange(len(fitted), device=avatar.device)
     omegas = largest([hand.temporal(rows).omega for hand in model.biases]).abs()
     if frames is None:
         frames = sorted(fitted[row] for row in omegas.argsort(descending=True)[:8].tolist())
@@ -134,25 +144,25 @@ def explain_frames(
         if frame not in fitted:
             raise UsageError(f"{frame} was not fitted", field="frames")
     posed = avatar.believed_capture(capture)
-    clip = TrainingClip(posed, np.array(fitted), model.rigs, torch.device("cpu"))
+    clip = TrainingClip(posed, np.array(fitted), model.rigs, torch.device(avatar.device))
     info, found = capture.info, []
     for frame in frames:
         row = fitted.index(frame)
         pictures = []
         for biases in (False, True):
-            kept = {side: torch.tensor([biases]) for side in model.perturbation}
+            given = torch.tensor([biases], device=avatar.device)
             drawing = model.draw_frames(
                 clip,
-                torch.tensor([row]),
+                rows[row : row + 1],
                 info.width,
                 info.height,
-                kept=kept,
-                move=torch.tensor([biases]),
+                kept=dict.fromkeys(model.perturbation, given),
+                move=given,
                 refine=avatar.settings.heads,
                 pose_head=biases,
             )
             image = drawing.image[0] if biases else drawing.image[0] / model.log_gains[row].exp()
-            pictures.append(image.clamp(0.0, 1.0).numpy())
+            pictures.append(image.clamp(0.0, 1.0).cpu().numpy())
         seen = capture.frame(frame) / 255.0 * (capture.mask(frame)[..., None] / 255.0)
         found.append(Explanation(frame, float(omegas[row]), seen, *pictures))
     return found
@@ -167,9 +177,10 @@ def temporal_weights(
     See `CaptureInfo.rank_with_severity`.
     """
     frames, found = avatar.record.frames, {}
+    rows = torch.arange(len(frames), device=avatar.device)
     for side in avatar.model.perturbation:
-        temporal = avatar.model.biases_of(side).temporal(torch.arange(len(frames)))
-        sizes = temporal.omega.abs()
+        temporal = avatar.model.biases_of(side).temporal(rows)
+        sizes = temporal.omega.abs().cpu()
         rank = capture.info.rank_with_severity(frames, sizes.tolist())
         found[side] = float(sizes.numpy().mean()), rank
     return found

@@ -20,7 +20,7 @@ from hwp_bench.capture import Capture
 from hwp_bench.capture.schema import METADATA
 from hwp_bench.methods.contract import Camera, HandPose
 from wildghand.avatar.avatar import PosedGaussians, WildGHandAvatar, over, splat
-from wildghand.avatar.render import shown_sides
+from wildghand.avatar.render import hands_of, shown_sides
 from wildghand.avatar.studio import HandAngles
 
 
@@ -103,7 +103,7 @@ class Motion:
 
     def __init__(self, avatar: WildGHandAvatar, capture: Capture) -> None:
         self._avatar, self._capture = avatar, capture
-        self._sides = shown_sides(avatar, capture)
+        shown_sides(avatar, capture)  # refuses a capture of other hands
         #: (F,) s, when each frame was recorded.
         self.times = capture.info.frame_times()
 
@@ -111,9 +111,8 @@ class Motion:
         return self._capture.info.frame_count
 
     def hands(self, frame: int) -> dict[str, HandPose]:
-        """The hands of a frame by side, in the avatar's corrected poses."""
-        poses = self._avatar.believed(self._capture.hand_poses(frame))
-        return {side: poses[side] for side in self._sides}
+        """The hands of a frame by side; see `hands_of`."""
+        return hands_of(self._avatar, self._capture, frame)
 
     def camera(self, frame: int) -> Camera:
         """The camera of a frame."""
@@ -261,6 +260,8 @@ class PosedView:
         least, most = angles.lower[joint, angle], angles.upper[joint, angle]
 
         def change(hands: Hands) -> Hands:
+            if side not in hands:  # The capture shows the other hand alone.
+                return hands
             found = angles.angles(hands[side].pose)
             found[joint, angle] = np.clip(degrees, least, most)
             return {**hands, side: dataclasses.replace(hands[side], pose=angles.pose(found))}

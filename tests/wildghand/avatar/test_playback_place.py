@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,7 +16,7 @@ from hwp_bench.base.errors import UsageError
 from hwp_bench.base.images import read_rgb
 from hwp_bench.capture import Capture
 from wildghand.avatar.avatar import WildGHandAvatar
-from wildghand.avatar.render import render_clip
+from wildghand.avatar.render import hands_of, render_clip
 
 
 def _blank(capture: Capture) -> Any:
@@ -23,6 +24,8 @@ def _blank(capture: Capture) -> Any:
     return SimpleNamespace(
         sides=("right",),
         hand_model=capture.info.hand_model,
+        betas={"right": np.zeros(10)},
+        believed=dict,
         render=lambda hands, camera: np.zeros((camera.height, camera.width, 4)),
     )
 
@@ -70,3 +73,16 @@ def test_every_frame_is_drawn_in_its_own_pose_over_the_background(
         expected = 255.0 * rgba[..., :3] + 100.0 * (1.0 - rgba[..., 3:])
         np.testing.assert_allclose(image, expected, atol=0.51)
     assert not np.array_equal(found[2], found[10])
+
+
+def test_the_motion_of_another_person_does_not_change_the_shape(
+    tiny_avatar: WildGHandAvatar, make_painted: Callable[..., Capture]
+) -> None:
+    own = make_painted()
+    hand = own.hands["right"]
+    other = replace(own, hands={"right": replace(hand, betas=hand.betas + 1.0)})
+    for frame in (0, 5):
+        found = hands_of(tiny_avatar, other, frame)["right"]
+        expected = tiny_avatar.believed(own.hand_poses(frame))["right"]
+        for name in ("pose", "betas", "transl"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
