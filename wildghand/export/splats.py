@@ -19,12 +19,13 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from hwp_bench.base.colors import srgb_to_linear
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.capture import Capture
 from hwp_bench.hands import TemplateTensors
 from hwp_bench.methods.contract import HandPose
 from wildghand.avatar.avatar import PosedGaussians, WildGHandAvatar
-from wildghand.avatar.render import shown_sides
+from wildghand.avatar.render import hands_of
 from wildghand.gaussians.quaternions import quat_multiply, quat_third_axis
 
 #: Turns in degrees: about the camera's vertical, then about its horizontal. The first is the front.
@@ -96,9 +97,7 @@ def standing(avatar: WildGHandAvatar, capture: Capture | None, frame: int) -> Po
     """Hands as a frame of a capture shows them; without a capture, as they stand in the studio."""
     if capture is None:
         return PosedCamera(avatar.studio.posed(), np.eye(4))
-    shown = capture.hand_poses(frame)
-    hands = avatar.believed({side: shown[side] for side in shown_sides(avatar, capture)})
-    return PosedCamera(hands, capture.camera(frame).viewmat)
+    return PosedCamera(hands_of(avatar, capture, frame), capture.camera(frame).viewmat)
 
 
 def turned(
@@ -462,7 +461,9 @@ def splat_glb_bytes(splats: PosedGaussians, harmonics: np.ndarray, generator: st
     Programs that do not know the extension show coloured points.
     """
     made = GlbBuilder(generator)
-    colors = np.concatenate((splats.colors, splats.opacities[:, None]), axis=1).clip(0.0, 1.0)
+    # COLOR_0 is linear in glTF, the extension's own colours are sRGB.
+    shown = srgb_to_linear(splats.colors.clip(0.0, 1.0))
+    colors = np.concatenate((shown, splats.opacities[:, None]), axis=1).clip(0.0, 1.0)
     quats = np.roll(splats.quats, -1, axis=1)
     own = {
         "SCALE": splats.scales,

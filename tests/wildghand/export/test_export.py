@@ -20,6 +20,8 @@ import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from skimage.color import rgb2xyz
+from skimage.color.colorconv import xyz_from_rgb
 from splat_files import read_ply
 from splat_transform import transform, validation_errors
 from tiny_fits import TINY
@@ -42,6 +44,7 @@ from wildghand.export.splats import (
     packed_rotations,
     ply_bytes,
     scaled,
+    splat_glb_bytes,
     spz_bytes,
 )
 
@@ -220,7 +223,7 @@ def attribute(made: pygltflib.GLTF2, name: str) -> np.ndarray:
 @pytest.mark.slow
 def test_a_glb_of_gaussians_is_the_one_that_splat_transform_writes(tmp_path: Path) -> None:
     """Both files are made of the same Gaussians and hold the same arrays."""
-    from wildghand.export.splats import EXTENSION, splat_glb_bytes
+    from wildghand.export.splats import EXTENSION
 
     splats = some_splats()
     mine, theirs = tmp_path / "mine.glb", tmp_path / "theirs.glb"
@@ -479,6 +482,16 @@ def read_spz(path: Path) -> tuple[PosedGaussians, np.ndarray]:
         0.5 + SH_CONSTANT * constant[:, 0],
     )
     return splats, np.concatenate([constant, others], axis=1)
+
+
+def test_points_of_a_glb_have_linear_colors() -> None:
+    """Oracle: the specification of glTF, and scikit-image's curve of sRGB."""
+    splats = some_splats()
+    made = pygltflib.GLTF2.load_from_bytes(splat_glb_bytes(splats, even(splats), "test"))
+    found = attribute(made, "COLOR_0")
+    expected = rgb2xyz(splats.colors.astype(np.float64))
+    np.testing.assert_allclose(found[:, :3] @ xyz_from_rgb.T, expected, atol=1e-4)
+    np.testing.assert_allclose(found[:, 3], splats.opacities, atol=1e-6)
 
 
 def read_splat_glb(path: Path) -> tuple[PosedGaussians, np.ndarray]:
