@@ -138,10 +138,10 @@ _EXPORT_EXAMPLES = """examples:
   wildghand export frame649.pth -o hand.ply      # Gaussians that the authors' code has made
 
 The extension decides the format: .ply, Gaussians in the layout of 3DGS; .spz, the same in a tenth
-of the size; .glb, Gaussians as glTF (KHR_gaussian_splatting, a release candidate), or with --mesh
-a skinned mesh with 16 joints a hand, a texture and a motion. Lengths are metres. In place of an
-avatar's folder a file (.pth, .ckpt) may stand with the Gaussians of one pose, as the authors' code
-makes them; docs/export.md says how it is saved.
+of the size; .glb, Gaussians as glTF (KHR_gaussian_splatting), or with --mesh a skinned mesh with 16
+joints a hand, a texture and a motion. Lengths are metres. In place of an avatar's folder a file
+(.pth, .ckpt) may stand with the Gaussians of one pose, as the authors' code makes them;
+docs/export.md says how it is saved.
 """
 
 

@@ -45,7 +45,7 @@ from wildghand.export.splats import (
 FORMATS = {
     ".ply": "Gaussians in the layout of 3DGS",
     ".spz": "Gaussians, a tenth of the size, with rounded numbers",
-    ".glb": "Gaussians as glTF (KHR_gaussian_splatting, a release candidate), or with --mesh a "
+    ".glb": "Gaussians as glTF (KHR_gaussian_splatting), or with --mesh a "
     "skinned mesh with a texture and a motion",
 }
 _GENERATOR = f"wildghand {__version__}"
