@@ -33,11 +33,12 @@ from wildghand.from_video.run import (
     JobRecord,
     VideoFit,
     VideoJob,
+    read_record,
     run_stages,
     stride,
     with_quick,
 )
-from wildghand.from_video.stages import STAGES
+from wildghand.from_video.stages import STAGES, Import
 from wildghand.from_video.verdict import Verdict, read_verdict
 
 
@@ -137,7 +138,7 @@ def make_avatar(
     world.shard(chosen.schedule.batch)
     if world.is_main:
         _check_folder(job, overwrite=overwrite)
-        _check_requirements(job)
+        _check_requirements(job, imported=not overwrite and _is_imported(job))
     with exclusive(job.work) if world.is_main else contextlib.nullcontext():
         if overwrite and world.is_main:
             job.record.unlink(missing_ok=True)
@@ -164,18 +165,28 @@ def _check_folder(job: VideoJob, *, overwrite: bool) -> None:
     raise UsageError(problem, where=folder, remedy=remedy)
 
 
+def _is_imported(job: VideoJob) -> bool:
+    """Whether an earlier run has imported the video, and with the same choices."""
+    last = read_record(job.record).stages.get(Import.name)
+    if last is None or not (last.done and job.metadata.is_file() and job.landmarks.is_file()):
+        return False
+    return not last.changed(Import().facts(job))
+
+
 # Bytes of a job, for each stored pixel and for all the rest: on the disk, and in memory, where the
 # import holds frames at twice the stored edge too.
 _DISK_PIXEL, _DISK_REST = 6, 100_000_000
 _MEMORY_PIXEL, _MEMORY_REST = 23, 1_500_000_000
 
 
-def _check_requirements(job: VideoJob) -> None:
+def _check_requirements(job: VideoJob, *, imported: bool) -> None:
     """Check what a job needs before anything of it is made: video, programs, disk, memory."""
     info = probe(job.video)
     check_encoder()
     if job.options.landmarks is None and not job.landmarks.is_file():
         LiteRtNetworks(load_models(job.options.tracker))
+    if imported:
+        return  # What follows needs little of the disk and of memory.
     count = info.stated_frames or FRAMES
     frames = -(-count // stride(count, job.options.most_frames))
     pixels = frames * job.options.size**2
@@ -258,7 +269,12 @@ def fit(
     landmarks = None if landmarks is None else place(landmarks, "landmarks")
     log = None if tensorboard is None else place(tensorboard, "tensorboard")
     read = source.root if isinstance(source, Capture) else source
-    check_places({"out": out}, {"source": read, "landmarks": landmarks}, replaces=overwrite)
+    inputs = {"source": read, "landmarks": landmarks}
+    check_places({"out": out}, inputs, replaces=overwrite)
+    made = out
+    if out is None and not isinstance(source, Capture) and is_video(source):
+        made = default_folder(source)
+    check_places({"tensorboard": log, "out": made}, inputs)
     of_type(settings, (Mapping, type(None)), "settings", "a table of settings by name")
     of_type(side, (str, type(None)), "side", "a text")
     seconds = None if seconds is None else real_number(seconds, "seconds")

@@ -103,18 +103,8 @@ class VideoFit:
 
     def __post_init__(self) -> None:
         VideoImport(side=self.side, size=self.size)  # refuses what an import refuses
+        check_limits(self.steps, self.seconds, self.seed)
         check_choices(
-            (
-                "--steps",
-                self.steps is None or 1 <= self.steps <= MAX_COUNT,
-                f"must be 1 to {MAX_COUNT}",
-            ),
-            (
-                "--budget",
-                self.seconds is None or 0.0 < self.seconds <= MAX_SECONDS,
-                f"must be more than 0, and at most {MAX_SECONDS:g} s",
-            ),
-            ("--seed", 0 <= self.seed <= MAX_SEED, f"must be 0 to {MAX_SEED}"),
             (
                 "--model",
                 self.landmarks is None or self.tracker is None,
@@ -130,6 +120,19 @@ class VideoFit:
     def method_settings(self) -> dict[str, Any]:
         """Return the method's settings, with what a video and `quick` change."""
         return merged(VIDEO, nested(with_quick(self.settings, quick=self.quick)))
+
+
+def check_limits(steps: int | None, seconds: float | None, seed: int) -> None:
+    """Refuse limits of a fit that are out of range, in the words of the command."""
+    check_choices(
+        ("--steps", steps is None or 1 <= steps <= MAX_COUNT, f"must be 1 to {MAX_COUNT}"),
+        (
+            "--budget",
+            seconds is None or 0.0 < seconds <= MAX_SECONDS,
+            f"must be more than 0, and at most {MAX_SECONDS:g} s",
+        ),
+        ("--seed", 0 <= seed <= MAX_SEED, f"must be 0 to {MAX_SEED}"),
+    )
 
 
 def with_quick(settings: Mapping[str, Any], *, quick: bool) -> dict[str, Any]:

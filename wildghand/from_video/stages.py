@@ -30,8 +30,10 @@ from hwp_bench.tracking.networks import load_models
 from hwp_bench.tracking.track_video import NoHandSeen, landmark_sheet
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import CALL, DESCRIPTION, MODEL, WEIGHTS, load_avatar
+from wildghand.avatar.files import SCHEMA as AVATAR_SCHEMA
 from wildghand.avatar.studio import REST, Pose
 from wildghand.fitting.method import digest_of_named_files
+from wildghand.fitting.session import SCHEMA as STATE_SCHEMA
 from wildghand.fitting.session import fit_capture, unfinished
 from wildghand.from_video.run import Stage, VideoJob, stride
 from wildghand.from_video.verdict import judge_avatar, read_verdict
@@ -301,6 +303,7 @@ class FitStage(Stage):
     def facts(self, job: VideoJob) -> dict[str, str]:
         options = job.options
         return {
+            "version": f"{AVATAR_SCHEMA}, {STATE_SCHEMA}",
             "capture": open_capture(job.capture).digest,
             "settings": canonical_json(options.method_settings()),
             "files that settings name": digest_of_named_files(

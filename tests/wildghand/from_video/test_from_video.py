@@ -170,6 +170,26 @@ def test_what_changed_is_named_and_made_again(
     assert len(result.avatar.record.frames) == pytest.approx(fitted, abs=1)
 
 
+def test_what_another_version_has_fitted_is_fitted_again(
+    folder: Path, capsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stages, "STATE_SCHEMA", "wildghand-fit/0")
+    result = make_avatar(folder / "hand.avi", folder / "my_hand", choices(folder))
+    assert result.kept[:2] == ("track", "import")
+    assert "fit" not in result.kept
+    assert "changed since the last run: version." in capsys.readouterr().err
+
+
+def test_what_is_imported_needs_no_room_for_an_import(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=0))
+    result = make_avatar(folder / "hand.avi", folder / "my_hand", choices(folder))
+    assert list(result.kept) == NAMES
+    with pytest.raises(UsageError, match="of disk"):
+        make_avatar(folder / "hand.avi", folder / "my_hand", choices(folder, size=128))
+
+
 def test_another_video_of_the_same_name_is_noticed(folder: Path, capsys) -> None:
     clip = make_clip(COUNT, bend=0.2)
     write_video(folder / "hand.avi", [clip.picture(frame) for frame in range(COUNT)])
