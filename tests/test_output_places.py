@@ -16,7 +16,8 @@ from wildghand.cli.main import main as wildghand
 from wildghand.from_video.make import fit
 
 #: Commands whose output would mix with another output, an input or a capture; C is a capture, R
-#: and S are results, V a video, L landmarks, M a method, A an avatar, X nothing. Then what is said.
+#: and S are results, V a video, L landmarks, M a method, A an avatar, B one of a video, X nothing.
+#: Then what is said.
 WRONG = [
     ("wildghand render A --poses C -o X --video X/x.mp4", "--video: lies in the output --out"),
     ("wildghand render A --poses C -o X --video X", "is the output --video too"),
@@ -30,7 +31,15 @@ WRONG = [
     ("wildghand fit C -o C/avatar", "lies in the input"),
     ("wildghand fit C -o M --overwrite", "is a folder with something else than an avatar"),
     ("wildghand fit C -o M", "Choose another name, or delete it."),
+    ("wildghand fit C -o B --overwrite", "is a folder with something else than an avatar"),
     ("wildghand fit C -o L --overwrite", "is a file"),
+    ("wildghand fit C -o X --tensorboard X/logs", "--tensorboard: lies in the output --out"),
+    ("wildghand fit V.mp4 --tensorboard V_avatar/logs", "lies in the output --out"),
+    ("wildghand fit C -o X --budget 2e9", "--budget: must be more than 0"),
+    ("wildghand fit C -o X --steps 0", "--steps: must be 1 to"),
+    ("wildghand judge C -o L", "--out: exists"),
+    ("wildghand judge C -o X --picture L", "--picture: exists"),
+    ("wildghand explain A C -o L", "--out: exists"),
     ("wildghand pretrain C -o . --overwrite", "holds the input CAPTURE"),
     ("wildghand pretrain C captures/c -o M --overwrite", "something else than a prior"),
     ("wildghand export A -o A/hand.ply", "lies in the input AVATAR"),
@@ -90,8 +99,10 @@ def here(make_capture: CaptureMaker, tmp_path: Path, monkeypatch: pytest.MonkeyP
     for name, level in (("R", 25.0), ("S", 20.0)):
         made = made_results(name.lower(), lambda c, f, s, level=level: level + c)
         write_results(tmp_path / name / "results.json", made)
-    for name in ("A", "D", "M"):
+    for name in ("A", "B", "D", "M"):
         (tmp_path / name).mkdir()
+    for name in ("avatar.json", "turntable.mp4"):
+        (tmp_path / "B" / name).write_text("of a video")
     (tmp_path / "M" / "method.toml").write_text(
         'schema = "hwp-method/1"\ntraining = "none"\n'
         'name = "m"\n[entry]\npredictions = "predictions"\n'

@@ -158,8 +158,13 @@ class _Description:
 
 
 def refuse_no_avatar(path: str | os.PathLike[str]) -> None:
-    """Refuse the place of an avatar where something else is."""
-    refuse_other(path, "an avatar", lambda folder: (folder / DESCRIPTION).is_file())
+    """Refuse the place of an avatar where something else is, or next to one in its folder."""
+
+    def is_avatar(folder: Path) -> bool:
+        names = {item.name for item in folder.iterdir()}
+        return DESCRIPTION in names <= {DESCRIPTION, MODEL, WEIGHTS, CALL}
+
+    refuse_other(path, "an avatar", is_avatar)
 
 
 def save_avatar(

@@ -95,7 +95,7 @@ def _do_fit(args: argparse.Namespace) -> int:
     from hwp_bench.base.errors import UsageError
     from hwp_bench.base.files import check_places
     from wildghand.fitting.parallel import run_in_world
-    from wildghand.from_video.make import is_video
+    from wildghand.from_video.make import default_folder, is_video
     from wildghand.gaussians.fit_loop import choose_device
     from wildghand.model.settings import read_settings
     from wildghand.viewer.server import Address
@@ -111,8 +111,11 @@ def _do_fit(args: argparse.Namespace) -> int:
         "--prior": args.prior,
     }
     check_places({"--out": args.out}, inputs, replaces=args.overwrite)
-    check_places({"--tensorboard": args.tensorboard}, inputs)
-    work = _video if is_video(args.source) else _capture
+    out = args.out
+    if video := is_video(args.source):
+        out = out or default_folder(args.source)
+    check_places({"--tensorboard": args.tensorboard, "--out": out}, inputs)
+    work = _video if video else _capture
     return run_in_world(
         lambda: choose_device(read_settings(_settings(args)).device),
         lambda world: work(args, world),
@@ -172,7 +175,7 @@ def _capture(args: argparse.Namespace, world: World) -> int:
     from hwp_bench.base.errors import UsageError
     from hwp_bench.methods.contract import Budget
     from wildghand.fitting.session import fit_capture
-    from wildghand.from_video.run import with_quick
+    from wildghand.from_video.run import check_limits, with_quick
 
     for option in ("side", "landmarks", "model", "hand-model", "size"):
         if getattr(args, option.replace("-", "_")) is not None:
@@ -181,9 +184,7 @@ def _capture(args: argparse.Namespace, world: World) -> int:
             )
     if args.out is None:
         raise UsageError("is missing", field="--out", remedy="Name the avatar folder to make.")
-    if args.budget is not None and not args.budget > 0.0:
-        raise UsageError(f"is {args.budget}", field="--budget", remedy="Use more than 0.")
-    check_fitting(args)
+    check_limits(args.steps, args.budget, args.seed)
     with watching(args, world) as (watch, _):
         avatar = fit_capture(
             args.source,

@@ -7,10 +7,10 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hwp_bench.base.files import check_places
+from hwp_bench.base.files import check_places, refuse_existing_file
 from hwp_bench.cli.options import add_json, print_json
 from hwp_bench.cli.program import complete
-from wildghand.cli.options import add_avatar, avatar_of
+from wildghand.cli.options import add_avatar, add_ending, avatar_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -36,7 +36,7 @@ def _add_judge(parser: argparse.ArgumentParser) -> None:
     add("capture", type=Path, help="capture folder")
     add("-o", "--out", type=Path, metavar="FILE", help="JSON file to write")
     add("--picture", type=Path, metavar="FILE", help="PNG file to write: the estimates over time")
-    add_json(parser)
+    add_ending(parser, "file")
 
 
 def _do_judge(args: argparse.Namespace) -> int:
@@ -49,6 +49,9 @@ def _do_judge(args: argparse.Namespace) -> int:
 
     outputs = {"--out": args.out, "--picture": args.picture}
     check_places(outputs, {"CAPTURE": args.capture})
+    for option, path in outputs.items():
+        if path is not None:
+            refuse_existing_file(path, overwrite=args.overwrite, field=option)
     capture = open_capture(args.capture)
     every = np.arange(len(capture))
     assessment = judge_frames(capture_input(capture, every, track(every.tolist(), "Reading")))
@@ -132,7 +135,7 @@ def _add_explain(parser: argparse.ArgumentParser) -> None:
     add("-o", "--out", type=Path, required=True, metavar="FILE", help="PNG file")
     text = "frames of the capture"
     add("--frames", type=int, nargs="+", action="extend", metavar="N", help=text)
-    add_json(parser)
+    add_ending(parser, "file")
 
 
 def _do_explain(args: argparse.Namespace) -> int:
@@ -142,6 +145,7 @@ def _do_explain(args: argparse.Namespace) -> int:
     from wildghand.prepass import frames_text
 
     check_places({"--out": args.out}, {"AVATAR": args.avatar, "CAPTURE": args.capture})
+    refuse_existing_file(args.out, overwrite=args.overwrite, field="--out")
     capture = open_capture(args.capture)
     avatar = avatar_of(args)
     found = explain_frames(avatar, capture, args.frames)
