@@ -296,8 +296,8 @@ def skinned_glb_bytes(
     for side, hand in hands.items():
         require_skinning(hand.template)
         template = hand.template
-        moved = template.joint_basis.numpy().astype(np.float64) @ np.asarray(hand.rest.betas)
-        joints = template.joints.numpy().astype(np.float64) + moved
+        moved = template.joint_basis.cpu().numpy().astype(np.float64) @ np.asarray(hand.rest.betas)
+        joints = template.joints.cpu().numpy().astype(np.float64) + moved
         first = _add_nodes(made, side, joints, np.asarray(hand.rest.transl))
         _add_mesh(made, side, hand, joints, first)
         _add_motion(made, clip, times, motion, side, joints, first, centre)
@@ -334,18 +334,19 @@ def _add_mesh(
 ) -> None:
     """Add mesh, texture, skin, and the node that shows them."""
     content, template, layout = made.content, hand.template, hand.layout
-    rest = template.vertices.numpy().astype(np.float64)
-    rest = rest + template.shape_basis.numpy().astype(np.float64) @ np.asarray(hand.rest.betas)
+    rest = template.vertices.cpu().numpy().astype(np.float64)
+    shape = template.shape_basis.cpu().numpy().astype(np.float64)
+    rest = rest + shape @ np.asarray(hand.rest.betas)
     # A vertex on a seam has several texture coordinates: one copy for each.
     pairs = np.stack((layout.faces.ravel(), layout.face_uv.ravel()), axis=1)
     kept, corners = np.unique(pairs, axis=0, return_inverse=True)
     vertex, texel = kept.T
-    places, uv, weights = rest[vertex], layout.uv[texel], template.weights.numpy()[vertex]
+    places, uv, weights = rest[vertex], layout.uv[texel], template.weights.cpu().numpy()[vertex]
     border = boundary_loop(layout.faces)
     if len(border):
         # A fan around the middle closes the open end of the wrist. Its faces run against the
         # edges of the skin, so that the surface has one outside.
-        count, skin = len(border), template.weights.numpy()[border]
+        count, skin = len(border), template.weights.cpu().numpy()[border]
         own, following = np.arange(count), (np.arange(count) + 1) % count
         fan = np.stack([following, own, np.full(count, count)], axis=1)
         around = 2.0 * np.pi * own / count

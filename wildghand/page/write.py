@@ -237,7 +237,10 @@ def mean_weights(
         hands, camera = capture.hand_poses(frame), capture.camera(frame)
         given = avatar.posed({side: hands[side] for side in rigs})
         anchors = {side: rigs[side].pose(*values) for side, values in given.items()}
-        viewmat, K = (torch.as_tensor(m, dtype=torch.float32) for m in (camera.viewmat, camera.K))
+        viewmat, K = (
+            torch.as_tensor(m, dtype=torch.float32, device=avatar.device)
+            for m in (camera.viewmat, camera.K)
+        )
         size = torch.Size((camera.height, camera.width))
         shown = seen_anchors(anchors, viewmat[None], K[None], size)
         for side, (pixels, facing) in shown.items():
