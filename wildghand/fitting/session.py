@@ -61,7 +61,7 @@ class _Clock:
     """The `Report` of a fit that nobody scores.
 
     Args:
-        before: seconds that earlier runs of the fit took.
+        before: seconds that preparing the fit took, or all until its state was saved.
         show: takes the number of steps that are done.
     """
 
@@ -87,7 +87,7 @@ class _Clock:
 
     @property
     def elapsed(self) -> float:
-        """Seconds of fitting, those of earlier runs included."""
+        """Seconds of the fit, those of its preparation and of earlier runs included."""
         return time.perf_counter() - self._start
 
 
@@ -173,14 +173,16 @@ def _fit_in(
         write_request(work / "request", capture, split, run)
     world.wait_for_main()
     chosen = read_settings(run.settings)
-    training = affordable(open_request(work / "request"), chosen, run.budget)
+    training = open_request(work / "request")
     digest = digest_of_request(work / "request", capture, chosen)
     entered = time.perf_counter()
     device = ready_fit(chosen.device)
     if world.is_main:
         ready = time.perf_counter() - entered
         notice(f"Kernels ready after {ready:.1f} s, which do not count as seconds of the fit.")
-    fit = make_fit(training, chosen, run.seed, device, world)
+    entered = time.perf_counter()
+    fit = make_fit(affordable(training, chosen, run.budget), chosen, run.seed, device, world)
+    prepared = time.perf_counter() - entered
 
     def look(step: int, loss: Loss) -> None:
         if watch is not None:
@@ -192,6 +194,7 @@ def _fit_in(
         work / STATE,
         digest,
         f"Fitting {capture.info.id}",
+        prepared=prepared,
         save=save,
         is_main=world.is_main,
         # Within a block each process holds its own part of the gradient that they share.
@@ -214,6 +217,7 @@ def run_resumed(
     digest: str,
     title: str,
     *,
+    prepared: float = 0.0,
     save: bool = True,
     is_main: bool = True,
     every: int = 1,
@@ -223,9 +227,13 @@ def run_resumed(
     """Run a fit from its saved state, if there is one, and save it every 20 seconds.
 
     It is saved after multiples of `every` steps only.
+
+    Args:
+        prepared: seconds of the budget that making the fit took.
     """
-    watchers, start, before = Watchers(), 0, 0.0
+    watchers, start, before = Watchers(), 0, prepared
     if state.is_file():
+        # Its seconds have those of the first preparation in them.
         start, before = load_state(state, fit, watchers, digest)
         if is_main:
             notice(f"Continuing after {start} steps.")

@@ -27,7 +27,9 @@ from hwp_bench.run import worker
 from hwp_bench.run.worker import RUN, read_facts
 from wildghand.fitting import session
 from wildghand.fitting.components import make_fit
+from wildghand.fitting.fit import Fit
 from wildghand.fitting.method import WildGHandMethod, ready_fit
+from wildghand.gaussians.fit_loop import Loss
 from wildghand.model.settings import read_settings
 
 #: Settings that call other kernels, or the same ones in another way.
@@ -129,6 +131,30 @@ def test_a_slow_compiler_is_not_in_the_seconds_of_wildghand_fit(
         line for line in capsys.readouterr().err.splitlines() if line.startswith("Kernels ready")
     ]
     assert float(line.partition(" s,")[0].rpartition(" ")[2]) >= 1e6
+
+
+def test_preparation_counts_once_in_the_seconds_of_wildghand_fit(
+    make_painted: Callable[..., Capture], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    jump = Jump()
+
+    def slow(*given: Any) -> Fit:
+        jump.ahead += 1e6
+        return make_fit(*given)
+
+    def stop(fit: Fit, step: int, loss: Loss) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(session, "time", jump)
+    monkeypatch.setattr(session, "make_fit", slow)
+    monkeypatch.setattr(session, "SAVE_EVERY", 0.0)
+    source, out = make_painted().root, tmp_path / "avatar"
+    given: dict[str, Any] = {"settings": BARE, "budget": Budget(seconds=1e6 + 1e5, steps=2)}
+    with pytest.raises(KeyboardInterrupt):
+        session.fit_capture(source, out, watch=stop, **given)
+    record = session.fit_capture(source, out, **given).record
+    assert record.steps == 2
+    assert 1e6 < record.seconds < 1e6 + 1e5
 
 
 def test_a_slow_compiler_is_not_in_the_seconds_of_an_evaluation(
