@@ -47,12 +47,9 @@ class Dpd(Component):
         """Which frames of a batch keep their biases in this step, (B,) bool by side."""
         if not batch.stepping:
             return {}
-        chances = self.drop[batch.rows]
-        kept = {
-            side: upload(draw_kept(chances, self._generator), fit.device)
-            for side in fit.model.perturbation
-        }
-        return {"kept": {side: keep[batch.part] for side, keep in kept.items()}}
+        # A frame is perturbed as a whole: what one hand left out, the other would still explain.
+        kept = upload(draw_kept(self.drop[batch.rows], self._generator), fit.device)
+        return {"kept": dict.fromkeys(fit.model.perturbation, kept[batch.part])}
 
     def loss(
         self, fit: Fit, batch: StepBatch, drawing: RenderedFrames, target: FrameTarget

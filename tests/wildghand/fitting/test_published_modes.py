@@ -171,6 +171,17 @@ def test_in_paper_a_frame_whose_omega_is_dropped_has_no_temporal_factor(
         torch.testing.assert_close(found, plain * factor[:, None, None], rtol=1e-5, atol=1e-6)
 
 
+def test_a_frame_drops_the_omegas_of_both_hands(make_training: TrainingMaker) -> None:
+    fit = fit_of(make_training("both"), "paper")
+    dpd = part(fit, Dpd)
+    dpd.drop.fill_(0.5)
+    batch = StepBatch(torch.arange(len(dpd.drop)), stepping=True)
+    kept = dpd.draws(fit, batch)["kept"]
+    assert set(kept) == {"left", "right"}
+    assert torch.equal(kept["left"], kept["right"])
+    assert 0 < int(kept["left"].sum()) < len(dpd.drop)
+
+
 def _without_omega(hands: Mapping[str, HandState]) -> dict[str, HandState]:
     return {side: replace(hand, omega=0.0 * hand.omega) for side, hand in hands.items()}
 
