@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
@@ -66,6 +67,7 @@ class Pao(Component):
         data, settings, device = fit.data, fit.settings, fit.device
         pao, count, clean = settings.pao, len(data.frames), data.judgement.clean
         self.weights = PerturbationAwareWeights(pao.variant, len(data.training.sides)).to(device)
+        self._start = copy.deepcopy(self.weights.state_dict())
         self._scaled = pao.variant == "scaled"
         self.median: float | Tensor | None = None
         self.tolerance, self.lifts = 0.0, torch.zeros(count)
@@ -160,6 +162,13 @@ class Pao(Component):
         """Keep it from weighing everything with 0."""
         if target.reward is not None:
             yield target.reward
+
+    def forget(self) -> None:
+        """Begin again, as before the first step."""
+        self.weights.load_state_dict(self._start)
+        self.median = None
+        if self.places is not None:
+            self.places.ordinary.zero_()
 
     def state_dict(self) -> dict[str, Any]:
         """See `Component`."""

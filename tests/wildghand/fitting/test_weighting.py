@@ -175,6 +175,23 @@ def test_regions_that_are_drawn_badly_count_less(make_training: TrainingMaker) -
     assert part(fit, Pao).median is not None
 
 
+def test_a_fit_that_goes_back_weighs_as_if_it_had_not_gone_on(make_training: TrainingMaker) -> None:
+    # Oracle: a fit that takes no step.
+    training = make_training()
+    fit, other = fit_of(training), fit_of(training)
+    start, before = fit.snapshot(), other._weight_masks()
+    for step in range(3):
+        fit.step(torch.tensor([step]), 0.0)
+    thresholds = part(fit, Pao).weights
+    assert thresholds.T_E.item() != thresholds.constants.error_threshold
+    fit.restore(start)
+    assert thresholds.T_E.item() == thresholds.constants.error_threshold
+    after = fit._weight_masks()
+    assert any(mask.any() and mask.min() < 255 for mask in after.values())
+    for frame, mask in before.items():
+        np.testing.assert_array_equal(after[frame], mask)
+
+
 def test_omega_starts_where_the_prepass_weight_puts_it(make_training: TrainingMaker) -> None:
     fit = fit_of(make_training())
     rows = torch.arange(len(fit.data.frames))
