@@ -300,10 +300,14 @@ def _evaluation_settings(args: argparse.Namespace) -> EvaluationSettings:
     from hwp_bench.methods.contract import RunSettings
     from hwp_bench.run.sandbox.confinement import Confinement
 
-    for name in ("budget", "steps", "time_limit", "memory_limit"):
+    for name in ("budget", "steps", "time_limit"):
         value = getattr(args, name)
         if value is not None and not 0 < value < float("inf"):
             raise UsageError(f"{value} is not above 0", field=f"--{name.replace('_', '-')}")
+    # From a byte to more than any machine has.
+    if args.memory_limit is not None and not 1e-9 <= args.memory_limit <= 1e9:
+        problem = f"{args.memory_limit:g} GB is not from 1e-9 to 1e9 GB"
+        raise UsageError(problem, field="--memory-limit")
     if args.budget is not None and args.time_limit is not None and args.time_limit <= args.budget:
         problem = f"{args.time_limit:g} s end a fit of {args.budget:g} s"
         remedy = "Leave room for what is drawn after it, or leave out one of the two."

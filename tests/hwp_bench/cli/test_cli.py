@@ -64,6 +64,7 @@ def test_no_command_and_unknown_commands_are_usage_errors(capsys) -> None:
         (["evaluate", "nowhere"], 1, "nowhere: is not a method directory"),
         (["evaluate", "baselines/plain", "--capture", "nowhere"], 1, "nowhere: is not a capture"),
         (["evaluate", "plain", "--capture", "x", "--budget", "-3"], 2, "--budget: -3.0"),
+        (["evaluate", "plain", "--capture", "x", "--memory-limit", "1e300"], 2, "1e-9 to 1e9 GB"),
         (["evaluate", "plain", "--capture", "x", "--set", "a b=1"], 2, "is not NAME=VALUE"),
         (["evaluate", "plain", "--capture", "x", "--set", "a.=1"], 2, "is not NAME=VALUE"),
         (["evaluate", "wildghand", "--capture", "x", "--set", "heads=false"], 1, "not a capture"),
