@@ -34,13 +34,11 @@ from hwp_bench.report.sources import (
     stacked,
 )
 from hwp_bench.report.study_tables import (
-    LEVEL_NOTE,
-    bias_rows,
+    RANK_NOTE,
     bias_table,
     cost_table,
     discrimination_table,
     rank_table,
-    refused_bias,
     robustness_table,
     seeds_table,
     severity_table,
@@ -191,11 +189,14 @@ def _bias_layout(sources: Sequence[ResultsSource], request: TableRequest) -> Tab
         if all(name in known for known in measured)
         or (request.published and name in METRIC_OF.values())
     )
+    if not sources:
+        return bias_layout([], names, [], request.published)
     captures = find_captures([source.results for source in sources], request.captures)
-    rows = [row[:-1] for row in bias_rows(sources, captures, names)]
-    if sources and not rows:
-        raise refused_bias()
-    return bias_layout(rows, names, [LEVEL_NOTE] if rows else [], request.published)
+    table = bias_table(sources, captures, names)
+    # The paper has no rank correlation, the last column.
+    rows = [row[:-1] for row in table.rows]
+    notes = [note for note in table.notes if note != RANK_NOTE]
+    return bias_layout(rows, names, notes, request.published)
 
 
 def _marks(paths: Sequence[str | os.PathLike[str]]) -> Marks:

@@ -30,7 +30,7 @@ from hwp_bench.report.sources import (
     mean_temporal_weight,
     rank_with_severity,
 )
-from hwp_bench.report.tables import HEADLINE, labels
+from hwp_bench.report.tables import HEADLINE, labels, over_seeds
 from hwp_bench.results import Results
 from hwp_bench.results.schema import score_rows
 from hwp_bench.taxonomy import PERTURBATIONS, perturbation
@@ -281,7 +281,7 @@ def severity_table(sources: Sequence[ResultsSource], captures: Mapping[str, Capt
     return table_of("By severity", columns, [note], breaks=breaks)
 
 
-def bias_rows(
+def _bias_rows(
     sources: Sequence[ResultsSource], captures: Mapping[str, CaptureInfo], metrics: Sequence[str]
 ) -> list[tuple[Cell, ...]]:
     """Return rows: capture, level, severity, method, scores, mean weight, and its correlation.
@@ -312,19 +312,33 @@ def _level(severity: float | None) -> str | None:
     return None if severity is None else next(word for top, word in LEVELS if severity < top)
 
 
-def bias_table(sources: Sequence[ResultsSource], captures: Mapping[str, CaptureInfo]) -> Table:
-    """Return the mean temporal weight against the perturbation level, a row per capture."""
-    names = [name for name in HEADLINE if all(name in s.results.metrics for s in sources)]
-    rows = bias_rows(sources, captures, names)
+def bias_table(
+    sources: Sequence[ResultsSource],
+    captures: Mapping[str, CaptureInfo],
+    metrics: Sequence[str] | None = None,
+) -> Table:
+    """Return the mean temporal weight and the perturbation level: a row per capture and method.
+
+    Args:
+        metrics: of the scores; None: those of `HEADLINE` that all have.
+    """
+    names = metrics
+    if names is None:
+        names = [name for name in HEADLINE if all(name in s.results.metrics for s in sources)]
+    rows = _bias_rows(sources, captures, names)
     if not rows:
-        raise refused_bias()
+        raise UsageError(
+            "none of these methods left temporal weights",
+            field="RESULTS",
+            remedy="A method leaves them in its diagnostics; docs/methods.md says how.",
+        )
     columns = [Column("Capture"), Column("Disturbance"), Column("Severity", 2), Column("Method")]
     columns += [score_column(name) for name in names]
     columns.append(Column("Mean temporal weight [1e-3]", 3))
     columns.append(Column("Rank correlation", 2))
-    return Table(
-        "Bias strength", tuple(columns), tuple(rows), (LEVEL_NOTE, RANK_NOTE), ranked=False
-    )
+    notes = (LEVEL_NOTE, RANK_NOTE)
+    table = Table("Bias strength", tuple(columns), tuple(rows), notes, ranked=False)
+    return over_seeds(table, [source.results for source in sources])
 
 
 #: The levels of the bias table.
@@ -336,15 +350,6 @@ LEVEL_NOTE = (
 RANK_NOTE = (
     "Rank correlation: Spearman's, of the weights of frames with the sum of their severities."
 )
-
-
-def refused_bias() -> UsageError:
-    """Return the error of results without temporal weights."""
-    return UsageError(
-        "none of these methods left temporal weights",
-        field="RESULTS",
-        remedy="A method leaves them in its diagnostics; docs/methods.md says how.",
-    )
 
 
 def seeds_table(sources: Sequence[ResultsSource]) -> Table:

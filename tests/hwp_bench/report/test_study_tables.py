@@ -136,6 +136,22 @@ def test_bias_is_the_mean_weight(on_disk) -> None:
     assert "published" in table.rows[-1][0]
 
 
+def test_bias_is_a_mean_over_seeds(on_disk) -> None:
+    source, capture = on_disk
+    for seed, weight in ((0, 0.001), (1, 0.003)):
+        folder = source.folder.with_name(f"seed{seed}")
+        write_results(folder / "results.json", replace(source.results, seed=seed))
+        place = folder / "captures" / "capture2" / "diagnostics" / "temporal.json"
+        write_json(place, {"frames": [0, 1], "weights": [0.0, weight]})
+    paths = [source.folder.with_name(f"seed{seed}") for seed in (0, 1)]
+    (row,) = cells(make_table(TableRequest(paths, by="bias", captures=[capture.root])))
+    assert row["Method"] == source.results.method.title
+    assert row["Mean temporal weight [1e-3]"] == pytest.approx(1.0)
+    (row,) = make_table(TableRequest(paths, paper=9, captures=[capture.root])).rows
+    assert row[0] == "capture2"
+    assert row[-1] == pytest.approx(1.0)
+
+
 @pytest.mark.parametrize(
     "value",
     [
