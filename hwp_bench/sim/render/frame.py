@@ -32,7 +32,14 @@ from hwp_bench.sim.effects import (
     shown_in,
 )
 from hwp_bench.sim.geometry.noise import generator
-from hwp_bench.sim.geometry.surface import RenderCost, Surface, Tracer, join, transformed
+from hwp_bench.sim.geometry.surface import (
+    RenderCost,
+    Surface,
+    Tracer,
+    join,
+    rigid,
+    transformed,
+)
 from hwp_bench.sim.light.lights import FOCUS_DISTANCE, steady_light
 from hwp_bench.sim.props.behind import NOTHING
 from hwp_bench.sim.render.stage import Body, Lens, LinearImage, RenderStage, between, render_instant
@@ -452,7 +459,11 @@ _OBJECT = 4
 
 
 def frame_layers(scene: Scene, result: SimulatedFrame, frame_count: int, size: int) -> np.ndarray:
-    """Compute the layers of a frame: (S, S, 10) float32 in the order of `CHANNELS`."""
+    """Compute the layers of a frame: (S, S, 10) float32 in the order of `CHANNELS`.
+
+    Motion is how far what a pixel shows is shifted in the next frame, px. What moves before the
+    backdrop (`Behind`) has the motion of the backdrop.
+    """
     recipe = result.plan
     next_scene = shown_in(scene, recipe.frame + 1, frame_count)
     scene = shown_in(scene, recipe.frame, frame_count)
@@ -460,7 +471,7 @@ def frame_layers(scene: Scene, result: SimulatedFrame, frame_count: int, size: i
     seconds = recipe.seconds
     later = seconds + scene.duration / frame_count
     hands = hands_at(scene, seconds)
-    view = viewmat(scene, seconds)
+    view, later_view = viewmat(scene, seconds), viewmat(scene, later)
     lens = Lens(intrinsics(scene, size), view, size, 1, seconds=seconds)
     body = stage.traced(stage.surface(hands))
     body = replace(body, surface=stage.under_sky(body.surface, stage.seen_sky(body)))
@@ -478,6 +489,8 @@ def frame_layers(scene: Scene, result: SimulatedFrame, frame_count: int, size: i
     layers[:, :3] = image.color.reshape(-1, 3)
     origin, directions = pixel_rays(lens.K, view, (0, size, 0, size), 1)
     rays = directions.reshape(-1, 3)
+    # Only turns of the camera move the backdrop.
+    layers[:, 8:] = _pixels(rays, lens.K, _turn(later_view)) - _pixels(rays, lens.K, _turn(view))
     hits = Tracer(now.vertices, now.faces, Counter()).first_hits(
         np.broadcast_to(origin, rays.shape), rays, "layers"
     )
@@ -490,7 +503,7 @@ def frame_layers(scene: Scene, result: SimulatedFrame, frame_count: int, size: i
     layers[hits.ray, 4:7] = spread(now.normals) @ view[:3, :3].T
     layers[hits.ray, 7] = owner[hits.face]
     before = _pixels(spread(now.vertices), lens.K, view)
-    after = _pixels(spread(then.vertices), lens.K, viewmat(scene, later))
+    after = _pixels(spread(then.vertices), lens.K, later_view)
     layers[hits.ray, 8:] = after - before
     return layers.reshape(size, size, -1)
 
@@ -518,6 +531,11 @@ def write_layers(
         reason = file.geterror() if file is not None else oiio.geterror()
         raise HwpError(f"cannot be written ({reason.strip()})", where=path)
     os.replace(temporary, path)
+
+
+def _turn(view: np.ndarray) -> np.ndarray:
+    """A view (4, 4) of what is infinitely far: its rotation alone."""
+    return rigid(view[:3, :3], np.zeros(3))
 
 
 def _pixels(points: np.ndarray, K: np.ndarray, view: np.ndarray) -> np.ndarray:

@@ -19,8 +19,8 @@ from hwp_bench.sim.effects import SUBFRAME_STEP, plan_frame
 from hwp_bench.sim.produce.capture import true_hands
 from hwp_bench.sim.produce.forecast import forecast, plan_table
 from hwp_bench.sim.props.objects import build_object
-from hwp_bench.sim.render.frame import SimulatedFrame, frame_layers, render_frame
-from hwp_bench.sim.scene.scene import with_effects
+from hwp_bench.sim.render.frame import CHANNELS, SimulatedFrame, frame_layers, render_frame
+from hwp_bench.sim.scene.scene import intrinsics, viewmat, with_effects
 from hwp_bench.sim.sensor import Sensor
 
 COUNT, SIZE = 40, 48
@@ -167,6 +167,31 @@ def test_linear_layers_hold_the_light_of_the_frame(make_scene: SceneMaker) -> No
     hand = result.clean_coverage == 1.0
     expected = srgb_to_linear(result.clean / 255.0)[hand].mean()
     assert found[hand].mean() == pytest.approx(expected, rel=0.02)
+
+
+def test_the_backdrop_moves_as_the_camera_turns(make_scene: SceneMaker) -> None:
+    # Oracle: where a pixel of the backdrop is then, the camera looks in the direction of now.
+    scene = make_scene()
+    result = render_frame(scene, CLEAN, COUNT, SIZE)
+    layers = frame_layers(scene, result, COUNT, SIZE)
+    behind = layers[..., CHANNELS.index("id")] == 0.0
+    motion = layers[..., -2:][behind]
+    K, now = intrinsics(scene, SIZE), result.plan.seconds
+    places = np.argwhere(behind)[:, ::-1] + 0.5
+
+    def looked_at(places: np.ndarray, seconds: float) -> np.ndarray:
+        rays = np.column_stack([places, np.ones(len(places))]) @ np.linalg.inv(K).T
+        world = rays @ viewmat(scene, seconds)[:3, :3]
+        return world[:, :2] / world[:, 2:]
+
+    later = now + scene.duration / COUNT
+    np.testing.assert_allclose(
+        looked_at(places + motion, later), looked_at(places, now), rtol=0, atol=1e-6
+    )
+    assert np.abs(motion).mean() > 0.01
+    still = make_scene(("handheld = true", "handheld = false"))
+    layers = frame_layers(still, render_frame(still, CLEAN, COUNT, SIZE), COUNT, SIZE)
+    assert (layers[..., -2:][layers[..., CHANNELS.index("id")] == 0.0] == 0.0).all()
 
 
 def test_frames_depend_on_the_seed_alone(make_scene: SceneMaker) -> None:
