@@ -199,8 +199,6 @@ class RequestRecord:
     free_view: Annotated[int, Meta(ge=0, le=MAX_FRAMES)] = 0
     #: Whether `template.npz` holds the subject's own mesh, in place of the hand model's template.
     own_template: bool = False
-    #: Frames in which the truth takes the place of estimated poses; none outside an oracle.
-    true_poses: list[Annotated[int, Meta(ge=0)]] = field(default_factory=list)
 
 
 class TrainingCapture:
@@ -236,14 +234,6 @@ class TrainingCapture:
         if not np.isin(self._train, self.split.train).all():
             raise BadInput(
                 "has a frame that the split does not train on", where=root / REQUEST, field="train"
-            )
-        #: (F,) bool, in which frames an oracle gives the truth in place of estimated poses.
-        self.true_poses = np.isin(np.arange(count), record.true_poses)
-        if max(record.true_poses, default=0) >= count:
-            raise BadInput(
-                f"has a frame beyond the {count} of the split",
-                where=root / REQUEST,
-                field="true_poses",
             )
 
     @property

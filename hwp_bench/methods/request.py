@@ -7,8 +7,7 @@ truth and no word about the perturbations. Of the free-view clip it holds parame
 The frames, masks and hands are the capture's own, or an oracle's choice, which bounds what a
 method can reach on a simulated capture: `clean` gives the clean version of every frame,
 `unperturbed-only` just those frames that nothing perturbs, and `true:NAMES` replaces single
-estimates by the truth, so that an error budget can tell what each of them costs. The request then
-says in which frames poses are true.
+estimates by the truth, so that an error budget can tell what each of them costs.
 """
 
 from __future__ import annotations
@@ -109,11 +108,10 @@ def write_request(path: Path, capture: Capture, split: Split, run: RunSettings) 
             train=material.train.tolist(),
             free_view=0 if clip is None else len(clip),
             own_template=mesh,
-            true_poses=np.flatnonzero(material.true_poses).tolist(),
         )
         content = {"schema": SCHEMA, **asdict(record)}
         # What a capture does not have is not said.
-        for name in ("free_view", "own_template", "true_poses"):
+        for name in ("free_view", "own_template"):
             if not content[name]:
                 del content[name]
         write_json(root / REQUEST, content)
@@ -146,8 +144,6 @@ class TrainingInputs:
     masks: str
     #: Hand parameters by side.
     hands: dict[str, HandParameters]
-    #: (F,) bool, where the truth takes the place of estimated poses.
-    true_poses: np.ndarray
 
 
 def frame_choice(truths: Iterable[str]) -> str:
@@ -177,15 +173,15 @@ def choose_training_inputs(capture: Capture, split: Split, choice: str) -> Train
         return _with_truths(capture, split, choice)
     if choice not in FRAME_CHOICES:
         raise UsageError(f"{choice!r} is not one of {', '.join(FRAME_CHOICES)}", field="frames")
-    hands, none = dict(capture.hands), np.zeros(len(capture), dtype=bool)
+    hands = dict(capture.hands)
     if choice == "perturbed":
-        return TrainingInputs(split.train, "frames", "masks", hands, none)
+        return TrainingInputs(split.train, "frames", "masks", hands)
     perturbed = _perturbed(capture)
     if choice == "unperturbed-only":
         train = split.train[~perturbed[split.train]]
         if not len(train):
             raise UsageError("has no unperturbed training frame", where=capture.root)
-        return TrainingInputs(train, "frames", "masks", hands, none)
+        return TrainingInputs(train, "frames", "masks", hands)
     truth = capture.true_hands
     if truth is None or "pixels" not in known_oracle_inputs(capture):
         raise UsageError(
@@ -194,7 +190,17 @@ def choose_training_inputs(capture: Capture, split: Split, choice: str) -> Train
             remedy="Only simulated captures do; use --train-on perturbed.",
         )
     repaired = {side: _replaced(hand, truth[side], perturbed) for side, hand in hands.items()}
-    return TrainingInputs(split.train, "clean", "clean_masks", repaired, perturbed)
+    return TrainingInputs(split.train, "clean", "clean_masks", repaired)
+
+
+def frames_of_true_poses(split: Split, choice: str) -> np.ndarray:
+    """(F,) bool: in which frames a choice of frames replaces poses by the truth, whatever acts."""
+    names, rows = _replaced_by(choice), np.zeros(split.frame_count, dtype=bool)
+    if "poses" in names:
+        rows[split.train] = True
+    if "test-poses" in names:
+        rows[split.validation] = rows[split.test] = True
+    return rows
 
 
 def choose_free_view_hands(clip: Capture, choice: str) -> dict[str, HandParameters]:
@@ -226,15 +232,13 @@ def _with_truths(capture: Capture, split: Split, choice: str) -> TrainingInputs:
     frames, masks = ("clean", "clean_masks") if "pixels" in names else ("frames", "masks")
     if "masks" in names and "pixels" not in names:
         masks = "true_masks"
-    rows = np.zeros(split.frame_count, dtype=bool)
-    rows[split.train] = "poses" in names
-    rows[split.validation] = rows[split.test] = "test-poses" in names
+    rows = frames_of_true_poses(split, choice)
     hands = dict(capture.hands)
     for side, truth in (capture.true_hands or {}).items():
         hands[side] = _replaced(hands[side], truth, rows)
         if "betas" in names:
             hands[side] = replace(hands[side], betas=truth.betas)
-    return TrainingInputs(split.train, frames, masks, hands, rows)
+    return TrainingInputs(split.train, frames, masks, hands)
 
 
 def _perturbed(capture: Capture) -> np.ndarray:

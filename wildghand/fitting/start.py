@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from hwp_bench.methods.request import frames_of_true_poses
 from wildghand.fitting.data import FitData
 from wildghand.fitting.fit import Component, Fit
 from wildghand.gaussians.training import TrainingFrames
@@ -26,8 +27,9 @@ class Poses(Component):
     def prepare(self, fit: Fit) -> None:
         """Replace the capture by one with corrected hands."""
         training, templates = fit.data.training, fit.data.templates
-        # An oracle gives true poses in some frames.
-        believed = believed_hands(templates, training.hands, training.cameras, training.true_poses)
+        # An error budget gives true poses in some frames.
+        exact = frames_of_true_poses(training.split, training.run.frames)
+        believed = believed_hands(templates, training.hands, training.cameras, exact)
         self.remembered = ClipPoses.of(training.hands, believed)
         if self.remembered is not None:
             fit.data.training = training.with_hands(believed)

@@ -21,6 +21,7 @@ from tiny_fits import QUICK, UNJUDGED
 from hwp_bench.capture import Capture
 from hwp_bench.hands import HandParameters
 from hwp_bench.methods.contract import Budget, TrainingCapture
+from hwp_bench.methods.request import frame_choice
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import load_avatar, save_avatar
 from wildghand.export.formats import ExportSettings, export
@@ -91,12 +92,12 @@ def test_an_avatar_keeps_what_it_believes_in_its_file(
     assert read.model.clip_poses is not None
 
 
-@pytest.mark.parametrize("part", ["train", "validation", "targets"])
-def test_a_fit_says_in_which_frames_an_oracle_gives_true_poses(
-    part: str, make_training: TrainingMaker, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("name", ["poses", "test-poses"])
+def test_a_fit_says_in_which_frames_an_error_budget_gives_true_poses(
+    name: str, make_training: TrainingMaker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     training = make_training("right")
-    training.true_poses[getattr(training, part)] = True
+    training.run = dataclasses.replace(training.run, frames=frame_choice([name]))
     told: list[np.ndarray] = []
 
     def believed(templates: object, hands: object, cameras: object, exact: np.ndarray) -> object:
@@ -105,7 +106,8 @@ def test_a_fit_says_in_which_frames_an_oracle_gives_true_poses(
 
     monkeypatch.setattr(start, "believed_hands", believed)
     make_fit(training, read_settings(UNJUDGED), 0, torch.device("cpu"))
-    np.testing.assert_array_equal(told[0], getattr(training, part))
+    others = [*training.validation, *training.targets]
+    assert [*told[0]] == [*(training.split.train if name == "poses" else others)]
 
 
 def test_the_loss_goes_by_the_poses_of_the_fitted_frames(
