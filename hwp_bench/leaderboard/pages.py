@@ -11,6 +11,7 @@ import json
 import math
 import re
 import tomllib
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
@@ -277,14 +278,17 @@ def _field_table(one: Field) -> Table:
 def _novel_views(rows: Sequence[BoardRow]) -> list[float | None]:
     """Mean over captures of the mean over a free-view clip, of each row.
 
-    None where a row lacks a clip that another one has: its mean would be of other captures.
+    None where a row has another clip of a capture than most rows, or none: its mean would be of
+    other frames.
     """
-    filmed = {c.id for row in rows for c in row.captures if c.free_view is not None}
+    counts = Counter((c.id, c.free_view.digest) for row in rows for c in row.captures if c.free_view)
+    usual = dict(clip for clip, _ in reversed(counts.most_common()))
     means: list[float | None] = []
     for row in rows:
-        clips = [c.free_view for c in row.captures if c.id in filmed]
+        clips = [c.free_view for c in row.captures if c.id in usual]
+        same = {c.id: c.free_view.digest for c in row.captures if c.free_view} == usual
         found = [fmean(frame.scores[METRIC] for frame in clip.frames) for clip in clips if clip]
-        means.append(fmean(found) if found and len(found) == len(clips) else None)
+        means.append(fmean(found) if found and same else None)
     return means
 
 

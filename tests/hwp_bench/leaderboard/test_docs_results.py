@@ -208,16 +208,18 @@ def test_how_many_others_are_behind_allows_for_their_number() -> None:
 
 
 def test_novel_views_are_compared_over_the_same_clips() -> None:
-    def row(*scores: float | None) -> SimpleNamespace:
+    def row(*scores: float | None, digest: str = "one") -> SimpleNamespace:
         captures = []
         for number, score in enumerate(scores):
-            clip = SimpleNamespace(frames=[SimpleNamespace(scores={"psnr": score})])
+            clip = SimpleNamespace(frames=[SimpleNamespace(scores={"psnr": score})], digest=digest)
             captures.append(SimpleNamespace(id=f"c{number}", free_view=clip if score else None))
         return SimpleNamespace(captures=captures)
 
     rows = [row(20.0, 30.0, None), row(None, 40.0, None), row(None, None, None)]
     assert _novel_views(rows) == [25.0, None, None]
     assert _novel_views(rows[2:]) == [None]
+    rows = [row(20.0, 30.0, digest="other"), row(20.0, 30.0), row(22.0, 30.0)]
+    assert _novel_views(rows) == [None, 25.0, 26.0]
 
 
 def test_a_suite_has_a_picture_that_the_page_shows(checkout: Path) -> None:
