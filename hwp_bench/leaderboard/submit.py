@@ -60,6 +60,7 @@ def add_entries(folder: Path, results: Iterable[Results]) -> list[Path]:
         check_current(entry)
     check_entries([*known, *(one for one in made if one.name not in {e.name for e in known})])
     for entry in made:
+        check_dates(entry)
         check_bound(entry)
     files = [write_entry(folder, entry) for entry in made]
     register(folder, made)

@@ -251,6 +251,8 @@ def test_an_entry_is_the_whole_result(fit_results, tmp_path: Path) -> None:
         "plain-smoke",
     ]
     check_entries(read_entries(tmp_path))
+    with pytest.raises(BadResult, match="not yet"):
+        add_entries(tmp_path, [fit_results("late", started="2199-01-01T00:00:00+00:00")])
 
 
 def test_a_changed_score_is_found(fit_results, tmp_path) -> None:
