@@ -281,7 +281,8 @@ def _novel_views(rows: Sequence[BoardRow]) -> list[float | None]:
     None where a row has another clip of a capture than most rows, or none: its mean would be of
     other frames.
     """
-    counts = Counter((c.id, c.free_view.digest) for row in rows for c in row.captures if c.free_view)
+    captures = [capture for row in rows for capture in row.captures]
+    counts = Counter((c.id, c.free_view.digest) for c in captures if c.free_view)
     usual = dict(clip for clip, _ in reversed(counts.most_common()))
     means: list[float | None] = []
     for row in rows:
