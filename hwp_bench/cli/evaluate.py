@@ -473,14 +473,16 @@ def _add_error_budget(parser: argparse.ArgumentParser) -> None:
 def _error_budget(args: argparse.Namespace) -> int:
     from hwp_bench.evaluation.budget.budget import check_oracle_inputs, run_budget
     from hwp_bench.methods.manifest import find_method, read_manifest
-    from hwp_bench.methods.request import ORACLE_INPUTS
+    from hwp_bench.methods.request import ORACLE_INPUTS, frame_choice
 
     settings = _evaluation_settings(args)
     manifest = read_manifest(find_method(args.method))
     truths = tuple(ORACLE_INPUTS) if args.truths is None else args.truths
     check_oracle_inputs(truths, settings)
     out = Path(args.out or f"runs/error-budget-{manifest.name}-{settings.suite}")
-    with _running(args, [Call(manifest, settings, out)]) as (captures, jobs, options):
+    # The call that asks for most.
+    call = replace(settings, run=replace(settings.run, frames=frame_choice(truths)))
+    with _running(args, [Call(manifest, call, out)]) as (captures, jobs, options):
 
         def on_run(index: int, count: int, name: str) -> OnCapture | None:
             notice(f"{index + 1} of {count}: {name}")

@@ -30,7 +30,7 @@ from hwp_bench.evaluation.results_folder import (
     refuse_other,
 )
 from hwp_bench.methods.contents import digest_of, refuse_links_out
-from hwp_bench.methods.contract import FRAME_CHOICES, Budget
+from hwp_bench.methods.contract import FRAME_CHOICES, Budget, RunSettings
 from hwp_bench.methods.manifest import (
     DEFAULT_PRESET,
     MethodManifest,
@@ -309,6 +309,7 @@ def check_call(
     overwrite: bool = False,
 ) -> None:
     """Refuse a call that cannot work, where the call alone shows it."""
+    _refuse_without_effect(manifest, settings.run)
     check_settings(manifest, settings.run.settings, field)
     manifest.preset(settings.preset, settings.suite)
     if settings.run.frames not in FRAME_CHOICES and ":" not in settings.run.frames:
@@ -327,6 +328,28 @@ def check_call(
     if not overwrite:
         plan = make_plan(manifest, (), with_setting_files(manifest, settings), {})
         refuse_other(out, plan.results([]))
+
+
+def _refuse_without_effect(manifest: MethodManifest, run: RunSettings) -> None:
+    """Refuse what a result would record of pictures though they were drawn without it.
+
+    A budget is let through: it says what they were drawn with.
+    """
+    if manifest.kind != "predictions":
+        return
+    given = {
+        "a seed other than 0": run.seed != 0,
+        "a limit of steps": run.budget != make_budget(run.budget.seconds, None),
+        "settings": bool(run.settings),
+        "an oracle": run.frames != FRAME_CHOICES[0],
+    }
+    for name, there in given.items():
+        if there:
+            raise UsageError(
+                f"holds pictures that were drawn before: {name} would have no effect",
+                where=manifest.root,
+                remedy="Leave it out.",
+            )
 
 
 def check_suite(

@@ -158,6 +158,30 @@ def test_a_submission_that_is_not_filled_renders_nothing(tmp_path: Path, capsys)
     assert "no predictions of capture0: every frame" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        (["evaluate", "mine", "--seed", "1"], "a seed other than 0"),
+        (["evaluate", "mine", "--seeds", "2"], "a seed other than 0"),
+        (["evaluate", "mine", "--budget", "16", "--steps", "9"], "a limit of steps"),
+        (["evaluate", "mine", "--set", "level=1"], "settings"),
+        (["evaluate", "mine", "--train-on", "clean"], "an oracle"),
+        (["error-budget", "mine"], "an oracle"),
+    ],
+)
+def test_what_has_no_effect_on_pictures_is_refused(
+    words: Sequence[str], name: str, tmp_path: Path, capsys
+) -> None:
+    picture = _method(tmp_path / "mine", 'predictions = "predictions"', "") / "predictions"
+    picture = picture / "capture4" / "000027.png"
+    picture.parent.mkdir(parents=True)
+    picture.touch()
+    assert main([*words, "--suite", "smoke"]) == 2
+    assert f"drawn before: {name} would have no effect" in capsys.readouterr().err
+    with pytest.raises(Rendered):
+        main(["evaluate", "mine", "--suite", "smoke", "--budget", "16"])
+
+
 def test_a_folder_that_another_run_writes_to_is_said_at_once(tmp_path: Path, capsys) -> None:
     from hwp_bench.base.folders import exclusive
 
