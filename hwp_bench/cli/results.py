@@ -142,6 +142,7 @@ def _add_compare(parser: argparse.ArgumentParser) -> None:
 
 def _compare(args: argparse.Namespace) -> int:
     from hwp_bench.analysis.compare import compare_results
+    from hwp_bench.base.records import whole_seed
     from hwp_bench.report.tables import HEADLINE
     from hwp_bench.results import read_all
     from hwp_bench.results.schema import add_isolation_note
@@ -152,7 +153,7 @@ def _compare(args: argparse.Namespace) -> int:
         args.metric or HEADLINE,
         all_metrics=bool(args.metric),
         resamples=args.resamples,
-        seed=args.seed,
+        seed=whole_seed(args.seed, "--seed"),
     )
     if args.json:
         print_json(comparison.as_dict())

@@ -108,6 +108,14 @@ def test_a_seed_below_zero_is_refused_by_the_simulator(tmp_path: Path, capsys) -
     assert not out.exists()
 
 
+def test_a_seed_below_zero_is_refused_by_a_comparison(tmp_path: Path, capsys) -> None:
+    for name in ("a", "b"):
+        made = made_results(name, lambda c, f, s: 20.0 + c)
+        write_results(tmp_path / name / "results.json", made)
+    assert main(["compare", str(tmp_path / "a"), str(tmp_path / "b"), "--seed", "-1"]) == 2
+    assert "--seed: -1 is not from 0 to" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("option", ["--author", "--reason", "--revises", "--link"])
 @pytest.mark.parametrize("text", ["\x1b[2J", "two\nlines", "\u202egnp", "x" * 1001])
 def test_a_submission_holds_lines_that_can_be_read(
