@@ -135,7 +135,12 @@ def _evaluate(args: argparse.Namespace) -> int:
                 print_table(tables[name])
     status = _report_outcome(out, results)
     if status:
-        say_next("hwp-bench", "check-method", method)
+        folders = sealed.captures if sealed else args.capture
+        where = ["--capture", *folders] if folders else []
+        if not where and call.manifest.kind == "predictions":
+            # There are none of the toy capture, which other methods are checked on.
+            where = ["--suite", args.suite]
+        say_next("hwp-bench", "check-method", method, *where)
     else:
         say_next("hwp-bench", "report", out, "-o", Path("reports") / out.name)
     return status

@@ -140,7 +140,9 @@ def _check(args: argparse.Namespace) -> int:
         print(f"{report.path}: {f'{errors} things wrong' if errors else 'nothing wrong'}")
         print_findings(report.findings)
     if report.ok:
-        say_next("hwp-bench", "evaluate", args.method, "--suite", args.suite or "smoke")
+        suite = ["--suite", args.suite or "smoke"]
+        where = ["--capture", *args.capture] if args.capture else suite
+        say_next("hwp-bench", "evaluate", args.method, *where)
     return 0 if report.ok else 1
 
 

@@ -326,7 +326,8 @@ def _add_verify(parser: argparse.ArgumentParser) -> None:
 
 def _verify(args: argparse.Namespace) -> int:
     from hwp_bench.evaluation.verify import verify_results
-    from hwp_bench.results import result_files
+    from hwp_bench.leaderboard.rules import SUITES
+    from hwp_bench.results import read_results, result_files
 
     splits = splits_of(args)
     files = [file for path in args.results for file in result_files(path)]
@@ -339,7 +340,7 @@ def _verify(args: argparse.Namespace) -> int:
     for outcome in () if args.json else outcomes:
         _print_verify(outcome)
     status = 1 if any(outcome.discrepancies for outcome in outcomes) else 0
-    if status == 0:
+    if status == 0 and all(read_results(file).suite in SUITES for file in files):
         say_next("hwp-bench", "leaderboard", "submit", *args.results, "-o", "submission")
     return status
 

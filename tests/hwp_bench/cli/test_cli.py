@@ -186,6 +186,34 @@ def test_evaluate_prints_the_table_and_says_where_things_are(
     assert "1 of 2 frames: 000019.png: does not exist" in capsys.readouterr().err
 
 
+def test_what_is_named_next_can_be_given(
+    make_capture: CaptureMaker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    from small_methods import write_submission
+
+    capture = make_capture(frames=20, size=48)
+    monkeypatch.chdir(tmp_path)
+    images = {f"tiny/{frame:06d}.png": capture.frame(frame) for frame in (18, 19)}
+    write_submission(Path("entry"), images)
+    where = ["--capture", str(capture.root)]
+
+    def follow(words: list[str], status: int = 0) -> list[str]:
+        """Give a command; returns the words that it says come next."""
+        assert main(words) == status
+        found = re.findall("^next: hwp-bench (.+)$", capsys.readouterr().err, re.MULTILINE)
+        return found[0].split() if found else []
+
+    evaluate = follow(["check-method", "entry", *where])
+    assert evaluate == ["evaluate", "entry", *where]
+    assert follow([*evaluate, "-o", "out"]) == ["report", "out", "-o", "reports/out"]
+    # The board takes results of suites alone.
+    assert follow(["verify", "out", *where]) == []
+    Path("entry/predictions/tiny/000019.png").unlink()
+    check = follow([*evaluate, "-o", "out", "--overwrite"], 1)
+    assert check == ["check-method", "entry", *where]
+    assert follow(check, 1) == []
+
+
 @pytest.mark.parametrize("jobs", ["1", "2"])
 def test_the_log_that_is_named_is_there(
     make_capture: CaptureMaker, tmp_path: Path, capsys, jobs: str
