@@ -218,7 +218,7 @@ class MethodManifest(ManifestFields):
         tables = [*self.presets.values(), *(switch.settings for switch in self.switches.values())]
         known = {name for table in tables for name, _ in flattened(table)}
         unknown = [name for name, _ in flattened(values) if name not in known]
-        for name in unknown if known and not self.settings else ():
+        for name in unknown if not self.settings else ():
             close = nearest(name, sorted(known), most=3, cutoff=0.75)
             if close:
                 problem = f"{name[:100]!r} is in no preset or switch of {self.name}"

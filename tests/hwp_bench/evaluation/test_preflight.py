@@ -230,6 +230,14 @@ def test_a_name_like_none_of_a_method_without_a_list_is_said(tmp_path: Path, cap
     with pytest.raises(Rendered):
         main(["evaluate", "mine", "--suite", "smoke", "--set", "wholly_other=1"])
     assert "wholly_other: mine does not list its settings" in capsys.readouterr().err
+    # The same of a method that has no presets either.
+    manifest = tmp_path / "mine" / "method.toml"
+    manifest.write_text(manifest.read_text().partition("[presets")[0])
+    code = METHOD.replace('float(settings["level"])', "0.5")
+    (tmp_path / "mine" / "mine.py").write_text(code)
+    with pytest.raises(Rendered):
+        main(["evaluate", "mine", "--suite", "smoke", "--set", "wholly_other=1"])
+    assert "wholly_other: mine does not list its settings" in capsys.readouterr().err
 
 
 def test_a_wrong_truth_renders_nothing(tmp_path: Path, capsys) -> None:
