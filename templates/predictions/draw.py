@@ -42,6 +42,7 @@ def draw(request, predictions, free):
 
 
 if __name__ == "__main__":
-    for request in sorted(Path(sys.argv[1]).iterdir()):
+    # Files may lie next to the folders of the requests.
+    for request in sorted(path.parent for path in Path(sys.argv[1]).glob("*/request.json")):
         folder = Path(__file__).parent / "predictions" / request.name
         draw(request, folder, folder / "free")

@@ -4,6 +4,7 @@ known fault is told of that fault, and of no other."""
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -88,11 +89,16 @@ def test_pictures_that_were_drawn_elsewhere_are_checked_and_scored(
     assert "python mine/draw.py inputs/requests" in capsys.readouterr().err
     capture = ["--capture", str(both.root)]
     assert main(["data", "inputs", *capture, "-o", "inputs"]) == 0
+    # The public part of a challenge has a manifest next to the requests.
+    assert main(["challenge", "publish", str(both.root), "-o", "exam"]) == 0
     assert main(["check-method", "mine"]) == 2
     assert "--suite SUITE or --capture PATH" in capsys.readouterr().err
     status, report = check(Path("mine"), both, capsys)
     assert (status, [one["field"] for one in report["findings"]]) == (1, ["missing"])
-    subprocess.run([sys.executable, "mine/draw.py", "inputs/requests"], check=True)
+    for requests in ("exam/public", "inputs/requests"):
+        shutil.rmtree("mine/predictions", ignore_errors=True)
+        subprocess.run([sys.executable, "mine/draw.py", requests], check=True)
+        assert [path.name for path in Path("mine/predictions").iterdir()] == [both.info.id]
     status, report = check(Path("mine"), both, capsys)
     assert (status, report["findings"]) == (0, [])
     assert main(["evaluate", "mine", *capture, "-o", "out"]) == 0
