@@ -55,6 +55,7 @@ WRONG = [
     ("report R S -o C", "is a capture"),
     ("report R S -o C/report", "lies in the capture"),
     ("report R S -o R", "is the input RESULTS too"),
+    ("report R S -o site", "--out: exists"),
     ("curves R S -o S/cost", "lies in the input RESULTS"),
     ("evaluate M --capture C -o C/runs", "lies in the input --capture"),
     ("evaluate M --capture C -o M/runs", "lies in the input METHOD_DIR"),
@@ -63,6 +64,7 @@ WRONG = [
     ("error-budget M --capture C -o M", "is the input METHOD_DIR too"),
     ("demo --methods M --out M/demo", "lies in the input METHOD_DIR"),
     ("data show C -o C/frames/000000.png", "lies in the input CAPTURE"),
+    ("data show C -o L", "--out: exists"),
     ("challenge publish C -o C/public", "lies in the input CAPTURES"),
     ("data inputs --capture C -o C/inputs", "lies in the input --capture"),
     ("data track V -o V", "is the input VIDEO too"),
@@ -77,6 +79,7 @@ WRONG = [
     ("data import video V --landmarks L -o M --overwrite", "something else than a capture"),
     ("data convert C -o . --hand-model anny --overwrite", "holds the input CAPTURE"),
     ("data export C -o C/hand.glb", "lies in the input CAPTURE"),
+    ("data export C -o hand.obj", "--out: exists"),
     ("leaderboard submit R -o R/submission", "lies in the input RESULTS"),
     ("leaderboard build -o C", "is a capture"),
     ("challenge reveal D -o D/public/revealed.json", "lies in the input SUITE"),
@@ -108,7 +111,8 @@ def here(make_capture: CaptureMaker, tmp_path: Path, monkeypatch: pytest.MonkeyP
         'name = "m"\n[entry]\npredictions = "predictions"\n'
     )
     (tmp_path / "M" / "predictions").mkdir()
-    for name in ("V", "L", "revealed"):
+    (tmp_path / "site").mkdir()
+    for name in ("V", "L", "revealed", "hand.obj", "site/index.html"):
         (tmp_path / name).write_text("not read")
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -126,6 +130,14 @@ def test_no_command_writes_where_something_else_is(
     assert "Traceback" not in error
     assert status == 2
     assert listing(here) == before
+
+
+@pytest.mark.usefixtures("here")
+def test_a_report_replaces_a_report_and_another_page_where_that_is_asked_for() -> None:
+    assert main(["report", "R", "S", "-o", "site", "--overwrite"]) == 0
+    assert main(["report", "R", "S", "-o", "site"]) == 0
+    for command in ("data show C -o L.png", "data export C -o hand.obj"):
+        assert main([*command.split(), "--overwrite"]) == 0
 
 
 def test_from_python_a_fit_does_not_replace_what_holds_its_capture(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from hwp_bench.base.console import JobsView, notice, track
 from hwp_bench.base.errors import BadSplit, UsageError, shown
-from hwp_bench.base.files import check_is_file, check_places
+from hwp_bench.base.files import check_is_file, check_places, refuse_existing_file
 from hwp_bench.base.tables import print_table
 from hwp_bench.cli.options import (
     SEVERAL,
@@ -133,6 +133,7 @@ def _add_show(parser: argparse.ArgumentParser) -> None:
     add("-o", "--out", help="PNG to write (default: ID-sheet.png here)")
     add("--frame-count", type=int, default=24, metavar="N", help="frames on it (default 24)")
     add("--edge", type=int, default=256, help="larger side of a frame, px (default 256)")
+    add_overwrite(parser, "a file that exists")
 
 
 def _show(args: argparse.Namespace) -> int:
@@ -147,6 +148,7 @@ def _show(args: argparse.Namespace) -> int:
     capture = open_capture(args.capture)
     out = Path(args.out or f"{capture.info.id}-sheet.png")
     check_places({"--out": out}, {"CAPTURE": args.capture})
+    refuse_existing_file(out, overwrite=args.overwrite, field="--out")
     print(write_image(out, contact_sheet(capture, count=count, edge=args.edge)))
     return 0
 
@@ -485,6 +487,7 @@ def _add_export(parser: argparse.ArgumentParser) -> None:
     add_out(parser, "mesh file to write", "FILE")
     add("--frame", type=int, default=0, help="index of the frame (default 0)")
     add("--truth", action="store_true", help="the true hands of a simulated capture")
+    add_overwrite(parser, "a file that exists")
 
 
 def _export(args: argparse.Namespace) -> int:
@@ -493,6 +496,7 @@ def _export(args: argparse.Namespace) -> int:
 
     check_places({"--out": args.out}, {"CAPTURE": args.capture})
     meshes = hand_meshes(open_capture(args.capture), args.frame, truth=args.truth)
+    refuse_existing_file(args.out, overwrite=args.overwrite, field="--out")
     path = write_meshes(meshes, args.out)
     count = sum(len(mesh.vertices) for mesh in meshes.values())
     print(f"{path}: {' and '.join(meshes)} hand, {count} vertices")

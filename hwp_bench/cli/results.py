@@ -15,6 +15,7 @@ from hwp_bench.cli.options import (
     SEVERAL,
     add_capture_folders,
     add_json,
+    add_overwrite,
     add_results,
     add_splits,
     captures_of,
@@ -280,6 +281,7 @@ def _add_report(parser: argparse.ArgumentParser) -> None:
     )
     add("--avatar-pages", action="store_true", help=text)
     add("--title", help="heading of the page (default: the methods)")
+    add_overwrite(parser, "an index.html that is no report")
 
 
 def _report(args: argparse.Namespace) -> int:
@@ -296,6 +298,7 @@ def _report(args: argparse.Namespace) -> int:
         base=args.baseline,
         title=args.title,
         avatar_pages=args.avatar_pages,
+        overwrite=args.overwrite,
     )
     for page in pages:
         notice(f"report: {page} ({page.stat().st_size / 1e6:.1f} MB)")

@@ -24,7 +24,7 @@ from hwp_bench.analysis.compare import (
 from hwp_bench.analysis.cost import PLAIN, CostAnalysis, analyse_cost
 from hwp_bench.analysis.pairing import MethodRuns, group_runs, refuse_unlike
 from hwp_bench.base.errors import UsageError
-from hwp_bench.base.files import atomic_write
+from hwp_bench.base.files import atomic_write, refuse_existing_file
 from hwp_bench.base.tables import Table
 from hwp_bench.capture.schema import CaptureInfo
 from hwp_bench.metrics import metric as metric_facts
@@ -71,6 +71,8 @@ T = TypeVar("T")
 
 #: Name of the page.
 PAGE = "index.html"
+# In the head of every page that is written here, by which one is told from a person's own.
+_GENERATOR = b'<meta name="generator" content="hwp-bench report">'
 
 
 def style_sheet() -> Markup:
@@ -130,6 +132,14 @@ def write_report(
 def _write(folder: Path, template: str, **values: Any) -> Path:
     text = render_template("hwp_bench.report", template, style=style_sheet(), **values)
     return atomic_write(folder / PAGE, text)
+
+
+def _is_report(page: Path) -> bool:
+    """Whether a file is a page that `_write` has written."""
+    if not page.is_file():
+        return False
+    with page.open("rb") as file:
+        return _GENERATOR in file.read(1000)
 
 
 def provenance(result: Results) -> dict[str, str]:
@@ -314,9 +324,16 @@ def write_reports(
     base: str | None = None,
     title: str | None = None,
     avatar_pages: bool = False,
+    overwrite: bool = False,
 ) -> list[Path]:
-    """Write the report of some results, or one report for each of the data that they are on."""
+    """Write the report of some results, or one report for each of the data that they are on.
+
+    Reports are replaced; other pages only with `overwrite`.
+    """
     groups = data_groups(sources, oracles=True)
+    for place in (folder, *(folder / group.label for group in groups)):
+        if not _is_report(place / PAGE):
+            refuse_existing_file(place / PAGE, overwrite=overwrite, field="--out")
 
     def write(place: Path, own: Sequence[ResultsSource], base: str | None) -> Path:
         return write_report(place, own, captures, base=base, title=title, avatar_pages=avatar_pages)
