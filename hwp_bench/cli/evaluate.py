@@ -62,9 +62,8 @@ def _add_evaluate(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EVALUATE
     add = parser.add_argument
     add("methods", nargs="+", metavar="METHOD_DIR", help=METHOD_HELP)
-    _add_evaluation(parser)
     sealed = "sealed part of a publication, instead of captures; checked against its commitment"
-    add("--sealed", metavar="DIR", help=sealed)
+    _add_evaluation(parser, sealed)
     out = "oracle, budget and a seed other than 0 are added to the name"
     text = f"results folder (default runs/METHOD-SUITE, of several runs/field-SUITE; {out})"
     add("-o", "--out", help=text)
@@ -75,9 +74,9 @@ def _add_evaluate(parser: argparse.ArgumentParser) -> None:
     add_json(parser, "print the result file; of several methods or seeds, files and table")
 
 
-def _add_evaluation(parser: argparse.ArgumentParser) -> None:
+def _add_evaluation(parser: argparse.ArgumentParser, sealed: str = "") -> None:
     """Add the arguments of every command that runs a method: captures, settings, limits."""
-    add_suite_or_captures(parser)
+    add_suite_or_captures(parser, sealed)
     add = parser.add_argument
     add("--preset", help="preset of the method (default: the suite's, if any)")
     text = "override one setting of the preset; may be given again"
@@ -271,8 +270,8 @@ def _sealed_part(args: argparse.Namespace) -> SealedPart | None:
         return None
     from hwp_bench.commitments import open_sealed
 
-    if args.capture or args.splits:
-        raise UsageError("has its own captures and splits", field="--sealed")
+    if args.splits:
+        raise UsageError("has its own splits", field="--sealed", remedy="Leave out --splits.")
     sealed = open_sealed(args.sealed)
     notice(f"sealed part is as committed to: {sealed.commitment}")
     return sealed

@@ -71,12 +71,17 @@ def add_capture_folders(parser: argparse.ArgumentParser, purpose: str) -> None:
     parser.add_argument("--capture", **SEVERAL, metavar="PATH", help=text)
 
 
-def add_suite_or_captures(parser: argparse.ArgumentParser) -> None:
-    """Add `--suite` and `--capture`, of which one can be given, and `--splits`."""
+def add_suite_or_captures(parser: argparse.ArgumentParser, sealed: str = "") -> None:
+    """Add `--suite`, `--capture` and, with a help, `--sealed`, of which one can be given.
+
+    `--splits` goes with them.
+    """
     add = parser.add_mutually_exclusive_group().add_argument
     text = "captures that are rendered, or imported, on first use (default mini)"
     add("--suite", choices=SUITES, default="mini", help=text)
     add("--capture", **SEVERAL, metavar="PATH", help="capture folders, instead of a suite")
+    if sealed:
+        add("--sealed", metavar="DIR", help=sealed)
     add_splits(parser)
 
 

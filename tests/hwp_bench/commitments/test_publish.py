@@ -209,8 +209,15 @@ def test_submissions_are_scored_against_the_sealed_part(
     for first, second in zip(sealed["captures"], plain["captures"], strict=True):
         assert first["frames"] == second["frames"]
         assert first["digest"] == second["digest"]
-    refused = [*words, str(tmp_path / "x"), "--sealed", str(publication.sealed), "--capture", "y"]
-    assert main(refused) == 2
+    refused = [*words, str(tmp_path / "x"), "--sealed", str(publication.sealed)]
+    for option in ("--capture", "--suite"):
+        with pytest.raises(SystemExit) as stop:
+            main([*refused, option, "smoke"])
+        assert stop.value.code == 2
+        assert f"argument {option}: not allowed with argument --sealed" in capsys.readouterr().err
+    assert main([*refused, "--splits", "y"]) == 2
+    assert "--sealed: has its own splits" in capsys.readouterr().err
+    assert not (tmp_path / "x").exists()
 
 
 def test_the_command(captures: list[Capture], tmp_path: Path, capsys) -> None:
