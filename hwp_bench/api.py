@@ -42,7 +42,7 @@ from hwp_bench.run.engine.processes import ParallelEngine
 from hwp_bench.suites.suite import ensure_suite
 from hwp_bench.taxonomy import SUITES
 
-#: A capture, its folder, or the name of a suite; `evaluate` takes one or several.
+#: The name of a suite; or a capture or its folder, of which `evaluate` takes one or several.
 Captures: TypeAlias = (
     "str | os.PathLike[str] | Capture | Sequence[os.PathLike[str] | str | Capture]"
 )
@@ -74,7 +74,7 @@ def evaluate(
             notebook, becomes a method directory for this call: it runs in a process of its own and
             sees none of the variables that are set elsewhere.
         captures: a suite (`smoke`, `mini`, `full`, `wild-dev`, `persistent`, `real-1`; rendered
-            or imported on first use), a capture or its folder, or a list of these.
+            or imported on first use), a capture or its folder, or a list of captures and folders.
         out: results folder; `runs/METHOD-SUITE` if None, with the oracle's name, the budget and
             a seed other than 0 behind it.
         preset: preset of the method; the suite's, else `default`, if None.
@@ -145,10 +145,13 @@ def _folders(captures: Captures) -> list[Path]:
     """The folders of one capture or several."""
     one = isinstance(captures, str | os.PathLike | Capture)
     several = [captures] if one else of_type(captures, Iterable, "captures", "a capture or several")
-    return [
+    folders = [
         item.root if isinstance(item, Capture) else place(item, f"captures[{index}]")
         for index, item in enumerate(several)
     ]
+    if not folders:
+        raise UsageError("is empty", field="captures", remedy="Name at least one capture.")
+    return folders
 
 
 def score(

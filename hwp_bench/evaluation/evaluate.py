@@ -39,6 +39,7 @@ from hwp_bench.methods.manifest import (
     find_setting_files,
     read_manifest,
 )
+from hwp_bench.methods.request import is_frame_choice
 from hwp_bench.metrics import PROTOCOLS
 from hwp_bench.metrics.lpips import load_available
 from hwp_bench.metrics.score import Network
@@ -312,7 +313,7 @@ def check_call(
     _refuse_without_effect(manifest, settings.run)
     check_settings(manifest, settings.run.settings, field)
     manifest.preset(settings.preset, settings.suite)
-    if settings.run.frames not in FRAME_CHOICES and ":" not in settings.run.frames:
+    if not is_frame_choice(settings.run.frames):
         known = ", ".join(FRAME_CHOICES)
         raise UsageError(f"{settings.run.frames!r} is not one of {known}", field="frames")
     for path in settings.confinement.exposed:

@@ -153,6 +153,12 @@ def frame_choice(truths: Iterable[str]) -> str:
     return _PREFIX + names if names else FRAME_CHOICES[0]
 
 
+def is_frame_choice(choice: str) -> bool:
+    """Whether a choice of frames is one of `FRAME_CHOICES`, or names truths of `ORACLE_INPUTS`."""
+    names = _replaced_by(choice)
+    return choice in FRAME_CHOICES or (bool(names) and set(names) <= ORACLE_INPUTS.keys())
+
+
 def known_oracle_inputs(capture: Capture) -> tuple[str, ...]:
     """The estimates of a capture whose truth is stored with it, in the order of `ORACLE_INPUTS`."""
     known = set()

@@ -62,9 +62,11 @@ def test_evaluate_names_the_argument(make_capture: CaptureMaker) -> None:
             refused(run(captures=[root, value]), "captures[1]")
     refused(run(captures=None), "captures")
     refused(run(captures=3), "captures")
+    refused(run(captures=[]), "captures")
     refused(run(preset=3), "preset")
     refused(run(settings=[("a", 1)]), "settings")
-    refused(run(frames=3), "frames")
+    for value in (3, "a:b", "true:", "true:colour"):
+        refused(run(frames=value), "frames")
     refused(run(jobs=0), "jobs")
     refused(run(seed=-1), "seed")
     refused(run(out=root / "runs"), "out")
