@@ -518,13 +518,13 @@ def compare_results(
     if not 100 <= resamples <= 1_000_000:
         raise UsageError(f"{resamples} is not between 100 and 1000000", field="--resamples")
     runs = group_runs(results)
-    refuse_unlike(runs)
     if len(runs) < 2:
         raise UsageError(
-            "there is only one method to compare",
+            "there is only one method to compare" if runs else "there is no result to compare",
             field="RESULTS",
             remedy="Results that differ only in the seed count as one method.",
         )
+    refuse_unlike(runs)
     wanted = [metric_facts(name).name for name in metrics]
     names = common_metrics(runs, wanted)
     if not names or (all_metrics and len(names) < len(wanted)):

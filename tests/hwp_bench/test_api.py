@@ -217,6 +217,8 @@ def test_compare_takes_results_and_folders(
     assert repr(found).startswith("Comparison(")
     with pytest.raises(hwp_bench.HwpError, match="only one method"):
         hwp_bench.compare(first)
+    with pytest.raises(hwp_bench.HwpError, match="no result to compare"):
+        hwp_bench.compare()
 
 
 def test_a_capture_gives_poses_and_cameras_and_says_what_it_is(make_capture: CaptureMaker) -> None:
