@@ -105,8 +105,10 @@ class Effect:
         """Change what the hands do."""
         return hands
 
-    def place_objects(self, scene: Scene, seconds: float, strength: float) -> list[Placement]:
-        """Bring objects into the frame."""
+    def place_objects(
+        self, scene: Scene, seconds: float, strength: float, moved: float
+    ) -> list[Placement]:
+        """Bring those objects that are there at `strength` to their places at strength `moved`."""
         return []
 
     def change_light(
@@ -266,14 +268,16 @@ class ObjectInteraction(Effect):
             changed[side] = track.blend(goal, weight)
         return changed
 
-    def place_objects(self, scene: Scene, seconds: float, strength: float) -> list[Placement]:
+    def place_objects(
+        self, scene: Scene, seconds: float, strength: float, moved: float
+    ) -> list[Placement]:
         """Place the objects."""
         return [
             Placement(
                 item.object,
                 item.variant,
                 item.anchor or scene.sides[0],
-                item.transform(seconds, strength),
+                item.transform(seconds, moved),
             )
             for item in self.items
             if strength >= item.above
@@ -474,9 +478,8 @@ def plan_frame(
     moment = float(moments(frame_count)[frame])
     seconds = moment * scene.duration
     acting = {
-        call.kind: (strengths or {}).get(call.kind, _strength_at(call, level(call, moment)))
-        for call in scene.effects
-        if level(call, moment)
+        kind: (strengths or {}).get(kind, strength)
+        for kind, strength in strengths_at(scene, moment).items()
     }
     shutter = None
     for call in scene.effects:
@@ -507,6 +510,12 @@ def plan_frame(
     )
 
 
+def strengths_at(scene: Scene, moment: float) -> dict[str, float]:
+    """Strength of every effect that acts at a moment."""
+    levels = ((call, level(call, moment)) for call in scene.effects)
+    return {call.kind: _strength_at(call, found) for call, found in levels if found}
+
+
 def hands_at(scene: Scene, seconds: float) -> dict[str, HandMoment]:
     """The hands at a time, with the effects on their pose."""
     hands = {side: track_moment(scene, side, seconds) for side in scene.sides}
@@ -517,12 +526,16 @@ def hands_at(scene: Scene, seconds: float) -> dict[str, HandMoment]:
     return hands
 
 
-def objects_at(scene: Scene, recipe: FramePlan, seconds: float) -> list[Placement]:
-    """The objects of a frame at a time within its shutter."""
+def objects_at(
+    scene: Scene, recipe: FramePlan, seconds: float, moved: Mapping[str, float] | None = None
+) -> list[Placement]:
+    """The objects of a frame at a time within its shutter; elsewhere with strengths `moved`."""
     return [
         placement
         for call, strength in _acting(scene, recipe)
-        for placement in read_effect(call, scene.id).place_objects(scene, seconds, strength)
+        for placement in read_effect(call, scene.id).place_objects(
+            scene, seconds, strength, (moved or {}).get(call.kind, strength)
+        )
     ]
 
 

@@ -30,6 +30,7 @@ from hwp_bench.sim.effects import (
     objects_at,
     plan_frame,
     shown_in,
+    strengths_at,
 )
 from hwp_bench.sim.geometry.noise import generator
 from hwp_bench.sim.geometry.surface import (
@@ -462,7 +463,8 @@ def frame_layers(scene: Scene, result: SimulatedFrame, frame_count: int, size: i
     """Compute the layers of a frame: (S, S, 10) float32 in the order of `CHANNELS`.
 
     Motion is how far what a pixel shows is shifted in the next frame, px. What moves before the
-    backdrop (`Behind`) has the motion of the backdrop.
+    backdrop (`Behind`) has the motion of the backdrop, and an object of an episode that ends with
+    this frame has the motion that it would have at the same strength.
     """
     recipe = result.plan
     next_scene = shown_in(scene, recipe.frame + 1, frame_count)
@@ -481,7 +483,8 @@ def frame_layers(scene: Scene, result: SimulatedFrame, frame_count: int, size: i
     now, then = body.surface, stage.surface(future_hands)
     owner = stage.owners(hands)
     if things is not None:
-        later_things = stage.things(objects_at(scene, recipe, later), future_hands)
+        strengths = strengths_at(next_scene, (recipe.frame + 1) / frame_count)
+        later_things = stage.things(objects_at(scene, recipe, later, strengths), future_hands)
         assert later_things is not None
         owner = np.concatenate([owner, np.full(len(things.surface.faces), _OBJECT)])
         now, then = join([now, things.surface]), join([then, later_things.surface])

@@ -194,6 +194,30 @@ def test_the_backdrop_moves_as_the_camera_turns(make_scene: SceneMaker) -> None:
     assert (layers[..., -2:][layers[..., CHANNELS.index("id")] == 0.0] == 0.0).all()
 
 
+@pytest.mark.parametrize(("frame", "above"), [(2, 0.0), (7, 0.5), (8, 0.0)])
+def test_an_object_moves_as_it_comes_and_goes(
+    make_scene: SceneMaker, frame: int, above: float
+) -> None:
+    # Oracle: the points that pixels show, shifted by the change of strength. Before frame 8 the
+    # strength falls below 0.5, and after it the episode is over.
+    scene = make_scene(('anchor = "right"', f'anchor = "world"\nabove = {above}'))
+    result = render_frame(scene, frame, COUNT, SIZE)
+    layers = frame_layers(scene, result, COUNT, SIZE).astype(float)
+    shown = layers[..., CHANNELS.index("id")] == 4.0
+    K, now = intrinsics(scene, SIZE), result.plan.seconds
+    rays = np.column_stack([np.argwhere(shown)[:, ::-1] + 0.5, np.ones(shown.sum())])
+    points = rays @ np.linalg.inv(K).T * layers[shown][:, [CHANNELS.index("Z")]]
+    view, later = (viewmat(scene, at) for at in (now, now + scene.duration / COUNT))
+    world = (points - view[:3, 3]) @ view[:3, :3]
+    before = result.plan.strength["hand_object_interaction"]
+    after = plan_frame(scene, frame + 1, COUNT, SIZE).strength
+    change = after.get("hand_object_interaction", before) - before
+    moved = (world - change * np.array([0.05, 0.0, 0.0])) @ later[:3, :3].T + later[:3, 3]
+    expected = (moved @ K.T)[:, :2] / moved[:, 2:] - rays[:, :2]
+    np.testing.assert_allclose(layers[shown][:, -2:], expected, rtol=0, atol=1e-3)
+    assert (np.abs(expected[:, 0]).mean() > 2.0) == (frame < 8)
+
+
 def test_frames_depend_on_the_seed_alone(make_scene: SceneMaker) -> None:
     first = render_frame(make_scene(), OBJECT, COUNT, SIZE)
     again = render_frame(make_scene(), OBJECT, COUNT, SIZE)
