@@ -401,14 +401,19 @@ def _developed(
     scene: Scene, recipe: FramePlan, images: tuple[LinearImage, ...], cost: RenderCost
 ) -> list[np.ndarray]:
     """Images of the same frame as the sensor stores them: (S, S, 3) uint8 sRGB each."""
-    colors = tuple(image.color for image in images)
-    if scene.sensor.auto is not None:
-        with cost.time("auto"):
-            gain = metered_gain(scene, scene.sensor.auto, recipe.seconds, cost)
-            colors = tuple(color * gain for color in colors)
+    gain = _gain(scene, recipe, cost)
+    colors = tuple(image.color * gain for image in images)
     with cost.time("sensor"):
         colors = record(scene.sensor, scene.seed, recipe.frame, colors)
         return [store(scene.sensor, eight_bit_srgb(color)) for color in colors]
+
+
+def _gain(scene: Scene, recipe: FramePlan, cost: RenderCost) -> np.ndarray:
+    """Factors of the frame's exposure and white balance: (3,)."""
+    if scene.sensor.auto is None:
+        return np.ones(3)
+    with cost.time("auto"):
+        return metered_gain(scene, scene.sensor.auto, recipe.seconds, cost)
 
 
 # Times of the capture whose exposure is averaged.
@@ -462,6 +467,8 @@ _OBJECT = 4
 def frame_layers(scene: Scene, result: SimulatedFrame, frame_count: int, size: int) -> np.ndarray:
     """Compute the layers of a frame: (S, S, 10) float32 in the order of `CHANNELS`.
 
+    They show its middle: all rows at once, without blur. The light has the frame's exposure and
+    white balance, and nothing else that the sensor does.
     Motion is how far what a pixel shows is shifted in the next frame, px. What moves before the
     backdrop (`Behind`) has the motion of the backdrop, and an object of an episode that ends with
     this frame has the motion that it would have at the same strength.
@@ -489,7 +496,8 @@ def frame_layers(scene: Scene, result: SimulatedFrame, frame_count: int, size: i
         owner = np.concatenate([owner, np.full(len(things.surface.faces), _OBJECT)])
         now, then = join([now, things.surface]), join([then, later_things.surface])
     layers = np.zeros((size * size, len(CHANNELS)), dtype=np.float32)
-    layers[:, :3] = image.color.reshape(-1, 3)
+    gain = _gain(scene, recipe, stage.cost)
+    layers[:, :3] = (image.color * gain).reshape(-1, 3)
     origin, directions = pixel_rays(lens.K, view, (0, size, 0, size), 1)
     rays = directions.reshape(-1, 3)
     # Only turns of the camera move the backdrop.
