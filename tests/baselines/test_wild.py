@@ -149,25 +149,6 @@ def test_test_frames_look_like_the_least_uncertain(make_training: TrainingMaker)
     torch.testing.assert_close(recipe.test_frame(), expected)
 
 
-def test_a_fit_that_goes_back_forgets_the_frames_of_later_steps(
-    make_training: TrainingMaker,
-) -> None:
-    recipe = wild_recipe(make_training)
-
-    def take(frame: int) -> torch.Tensor:
-        batch = batch_of(recipe.material, frame, fraction=0.5)
-        with torch.no_grad():
-            recipe.weights(batch, recipe.draw(batch))
-        return recipe.frame_uncertainty.clone()
-
-    sound, kept = take(0), recipe.snapshot()
-    assert not torch.equal(take(1), sound)
-    recipe.restore(kept)
-    assert torch.equal(recipe.frame_uncertainty, sound)
-    recipe.brightness[0] = torch.nan  # so is the mean error then
-    assert torch.equal(take(0), sound)
-
-
 def test_the_uncertainty_is_drawn_as_one_more_channel(make_training: TrainingMaker) -> None:
     """An opaque hand whose Gaussians all have the same uncertainty has it at every pixel."""
     recipe = wild_recipe(make_training)

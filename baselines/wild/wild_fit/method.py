@@ -357,22 +357,9 @@ class WildRecipe(PlainRecipe[WildSettings]):
         """Take note of how badly frames fit."""
         for place, row in enumerate(rows.tolist()):
             mean, before = errors[place][hand[place]].mean().cpu(), self._drawn[row]
-            if not mean.isfinite():  # the fit diverges, or the mask is empty
-                continue
             held = self.frame_uncertainty[row] * before if before else 0.0
             self.frame_uncertainty[row] = (held + mean) / (before + 1.0)
             self._drawn[row] += 1.0
-
-    def snapshot(self) -> dict[str, torch.Tensor]:
-        """See `Recipe`; what is known of the frames is not averaged, so `state` leaves it out."""
-        known = {"frame_uncertainty": self.frame_uncertainty, "drawn": self._drawn}
-        return {**super().snapshot(), **{name: value.clone() for name, value in known.items()}}
-
-    def restore(self, values: dict[str, torch.Tensor]) -> None:
-        """See `Recipe`."""
-        super().restore(values)
-        self.frame_uncertainty.copy_(values["frame_uncertainty"])
-        self._drawn.copy_(values["drawn"])
 
     def appear(self, colors: torch.Tensor, frame: torch.Tensor) -> Appearance:
         """How Gaussians of some colours, (N, 3), look in frames of some numbers, (B, E)."""
