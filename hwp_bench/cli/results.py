@@ -281,7 +281,7 @@ def _add_report(parser: argparse.ArgumentParser) -> None:
     )
     add("--avatar-pages", action="store_true", help=text)
     add("--title", help="heading of the page (default: the methods)")
-    add_overwrite(parser, "an index.html that is no report")
+    add_overwrite(parser, "an index.html that the toolkit did not write")
 
 
 def _report(args: argparse.Namespace) -> int:

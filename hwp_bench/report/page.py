@@ -71,7 +71,7 @@ T = TypeVar("T")
 
 #: Name of the page.
 PAGE = "index.html"
-# In the head of every page that is written here, by which one is told from a person's own.
+# In the head of every page that is written here, which marks it as a report.
 _GENERATOR = b'<meta name="generator" content="hwp-bench report">'
 
 
