@@ -401,19 +401,21 @@ def _developed(
     scene: Scene, recipe: FramePlan, images: tuple[LinearImage, ...], cost: RenderCost
 ) -> list[np.ndarray]:
     """Images of the same frame as the sensor stores them: (S, S, 3) uint8 sRGB each."""
-    gain = _gain(scene, recipe, cost)
-    colors = tuple(image.color * gain for image in images)
+    colors = _exposed(scene, recipe, tuple(image.color for image in images), cost)
     with cost.time("sensor"):
         colors = record(scene.sensor, scene.seed, recipe.frame, colors)
         return [store(scene.sensor, eight_bit_srgb(color)) for color in colors]
 
 
-def _gain(scene: Scene, recipe: FramePlan, cost: RenderCost) -> np.ndarray:
-    """Factors of the frame's exposure and white balance: (3,)."""
+def _exposed(
+    scene: Scene, recipe: FramePlan, colors: tuple[np.ndarray, ...], cost: RenderCost
+) -> tuple[np.ndarray, ...]:
+    """Linear light with the frame's exposure and white balance, where the camera sets them."""
     if scene.sensor.auto is None:
-        return np.ones(3)
+        return colors
     with cost.time("auto"):
-        return metered_gain(scene, scene.sensor.auto, recipe.seconds, cost)
+        gain = metered_gain(scene, scene.sensor.auto, recipe.seconds, cost)
+        return tuple(color * gain for color in colors)
 
 
 # Times of the capture whose exposure is averaged.
@@ -496,8 +498,8 @@ def frame_layers(scene: Scene, result: SimulatedFrame, frame_count: int, size: i
         owner = np.concatenate([owner, np.full(len(things.surface.faces), _OBJECT)])
         now, then = join([now, things.surface]), join([then, later_things.surface])
     layers = np.zeros((size * size, len(CHANNELS)), dtype=np.float32)
-    gain = _gain(scene, recipe, stage.cost)
-    layers[:, :3] = (image.color * gain).reshape(-1, 3)
+    (light,) = _exposed(scene, recipe, (image.color,), stage.cost)
+    layers[:, :3] = light.reshape(-1, 3)
     origin, directions = pixel_rays(lens.K, view, (0, size, 0, size), 1)
     rays = directions.reshape(-1, 3)
     # Only turns of the camera move the backdrop.
