@@ -21,11 +21,11 @@ from hwp_bench.base.console import track
 from hwp_bench.base.tables import Cell, to_markdown
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.cli.options import named_table
-from hwp_bench.sim.produce.calibration import TARGETS
+from hwp_bench.sim.produce.calibration import TARGETS, psnr
 from hwp_bench.sim.produce.capture import ensure_suite, suite
 from hwp_bench.taxonomy import perturbation
 
-#: Perturbations that change a frame, and how far from the stated loss the picture reaches.
+#: Perturbations that change a frame, and the range of their losses in the picture.
 KINDS: Mapping[str, tuple[float, float]] = {
     "hand_object_interaction": (0.0, 0.6),
     "illumination": (10.0, 60.0),
@@ -56,13 +56,13 @@ def losses(capture: Capture) -> list[Loss]:
         if len(acting) != 1 or acting[0][0] not in KINDS:
             continue
         (kind, level), hand = acting[0], capture.clean_mask(frame) == 255
-        if not level or not hand.any():
+        if not hand.any():
             continue
         if kind == "hand_object_interaction":
             value = 1.0 - float(capture.true_mask(frame)[hand].mean()) / 255.0
         else:
-            off = (capture.frame(frame)[hand] - capture.clean(frame)[hand].astype(float)) / 255.0
-            value = min(-10.0 * np.log10(max(float(np.mean(off**2)), 1e-9)), _EQUAL)
+            shown, clean = (read(frame)[hand] / 255.0 for read in (capture.frame, capture.clean))
+            value = min(psnr(shown, clean), _EQUAL)
         found.append(Loss(kind, level, value, f"{capture.info.id}, {frame}"))
     return found
 

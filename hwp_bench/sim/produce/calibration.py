@@ -133,7 +133,7 @@ def _measure(
             if call.kind == "hand_object_interaction":
                 values.append(1.0 - float(result.coverage[hand].mean()))
             else:
-                values.append(_psnr(result.rgb[hand] / 255.0, result.clean[hand] / 255.0))
+                values.append(psnr(result.rgb[hand] / 255.0, result.clean[hand] / 255.0))
         return float(np.mean(values))
 
     return loss
@@ -160,8 +160,9 @@ def _pose_loss(scene: Scene, frame: int, size: int, strength: float) -> float:
         images.append(render_instant(scene, lens, body, None, lights, cost))
     hand = images[0].coverage > 0.999
     true, believed = (linear_to_srgb(image.color[hand]) for image in images)
-    return _psnr(believed, true)
+    return psnr(believed, true)
 
 
-def _psnr(image: np.ndarray, target: np.ndarray) -> float:
+def psnr(image: np.ndarray, target: np.ndarray) -> float:
+    """PSNR of two images in [0, 1], dB; at most 100."""
     return float(-10.0 * np.log10(max(float(np.mean((image - target) ** 2)), 1e-10)))
