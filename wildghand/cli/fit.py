@@ -14,7 +14,6 @@ from wildghand.cli.options import (
     add_ending,
     add_fitting,
     address_of,
-    check_fitting,
 )
 
 if TYPE_CHECKING:
@@ -95,7 +94,7 @@ def _do_fit(args: argparse.Namespace) -> int:
     from hwp_bench.base.errors import UsageError
     from hwp_bench.base.files import check_places
     from wildghand.fitting.parallel import run_in_world
-    from wildghand.from_video.make import default_folder, is_video
+    from wildghand.from_video.make import folder_of, is_video
     from wildghand.gaussians.fit_loop import choose_device
     from wildghand.model.settings import read_settings
     from wildghand.viewer.server import Address
@@ -111,11 +110,9 @@ def _do_fit(args: argparse.Namespace) -> int:
         "--prior": args.prior,
     }
     check_places({"--out": args.out}, inputs, replaces=args.overwrite)
-    out = args.out
-    if video := is_video(args.source):
-        out = out or default_folder(args.source)
-    check_places({"--tensorboard": args.tensorboard, "--out": out}, inputs)
-    work = _video if video else _capture
+    outputs = {"--tensorboard": args.tensorboard, "--out": folder_of(args.source, args.out)}
+    check_places(outputs, inputs)
+    work = _video if is_video(args.source) else _capture
     return run_in_world(
         lambda: choose_device(read_settings(_settings(args)).device),
         lambda world: work(args, world),
@@ -244,11 +241,12 @@ def _add_pretrain(parser: argparse.ArgumentParser) -> None:
 
 def _do_pretrain(args: argparse.Namespace) -> int:
     from hwp_bench.base.files import check_places
+    from wildghand.from_video.run import check_limits
     from wildghand.pretrain.pretrain import pretrain
     from wildghand.prior.prior import WEIGHTS
 
     check_places({"--out": args.out}, {"CAPTURE": args.captures}, replaces=args.overwrite)
-    check_fitting(args)
+    check_limits(args.steps, None, args.seed)
     record = pretrain(
         args.captures,
         args.out,

@@ -6,7 +6,6 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hwp_bench.base.errors import UsageError
 from hwp_bench.cli.options import add_json
 
 if TYPE_CHECKING:
@@ -41,20 +40,12 @@ def add_ending(parser: argparse.ArgumentParser, what: str) -> None:
 
 
 def add_fitting(parser: argparse.ArgumentParser, steps: str) -> None:
-    """Add `--steps`, `--seed` and `--set`, which `check_fitting` checks."""
+    """Add `--steps`, `--seed` and `--set`; `check_limits` checks the first two."""
     add = parser.add_argument
     add("--steps", type=int, help=steps)
     add("--seed", type=int, default=0, help="seed of all random numbers (default: 0)")
     text = "a setting, as schedule.batch=4 (wildghand/model/settings.py); may be repeated"
     add("--set", action="append", default=[], metavar="NAME=VALUE", help=text)
-
-
-def check_fitting(args: argparse.Namespace) -> None:
-    """Refuse steps and seeds that are none."""
-    if args.steps is not None and args.steps < 1:
-        raise UsageError(f"is {args.steps}", field="--steps", remedy="Use 1 or more.")
-    if args.seed < 0:
-        raise UsageError(f"is {args.seed}", field="--seed", remedy="Use 0 or more.")
 
 
 def add_address(parser: argparse.ArgumentParser) -> None:

@@ -98,6 +98,13 @@ def default_folder(video: Path) -> Path:
     return video.with_name(f"{video.stem}_avatar")
 
 
+def folder_of(source: str | os.PathLike[str], out: str | os.PathLike[str] | None) -> Path | None:
+    """Return where the avatar of a video or a capture goes; None: nowhere."""
+    if out is not None:
+        return Path(out)
+    return default_folder(Path(source)) if is_video(source) else None
+
+
 def make_avatar(
     video: str | os.PathLike[str],
     out: str | os.PathLike[str] | None = None,
@@ -138,7 +145,7 @@ def make_avatar(
     world.shard(chosen.schedule.batch)
     if world.is_main:
         _check_folder(job, overwrite=overwrite)
-        _check_requirements(job, imported=not overwrite and _is_imported(job))
+        _check_requirements(job, overwrite=overwrite)
     with exclusive(job.work) if world.is_main else contextlib.nullcontext():
         if overwrite and world.is_main:
             job.record.unlink(missing_ok=True)
@@ -179,14 +186,12 @@ _DISK_PIXEL, _DISK_REST = 6, 100_000_000
 _MEMORY_PIXEL, _MEMORY_REST = 23, 1_500_000_000
 
 
-def _check_requirements(job: VideoJob, *, imported: bool) -> None:
+def _check_requirements(job: VideoJob, *, overwrite: bool) -> None:
     """Check what a job needs before anything of it is made: video, programs, disk, memory."""
     info = probe(job.video)
     check_encoder()
     if job.options.landmarks is None and not job.landmarks.is_file():
         LiteRtNetworks(load_models(job.options.tracker))
-    if imported:
-        return  # What follows needs little of the disk and of memory.
     count = info.stated_frames or FRAMES
     frames = -(-count // stride(count, job.options.most_frames))
     pixels = frames * job.options.size**2
@@ -196,7 +201,8 @@ def _check_requirements(job: VideoJob, *, imported: bool) -> None:
         "of memory": (_MEMORY_REST + _MEMORY_PIXEL * pixels, psutil.virtual_memory().available),
     }
     for name, (needed, free) in left.items():
-        if needed > free:
+        # After the import little is needed; to look for it reads the whole video.
+        if needed > free and (overwrite or not _is_imported(job)):
             raise UsageError(
                 f"{frames} frames need about {needed / 1e9:.1f} GB {name}, {free / 1e9:.1f} GB are "
                 "free",
@@ -271,10 +277,7 @@ def fit(
     read = source.root if isinstance(source, Capture) else source
     inputs = {"source": read, "landmarks": landmarks}
     check_places({"out": out}, inputs, replaces=overwrite)
-    made = out
-    if out is None and not isinstance(source, Capture) and is_video(source):
-        made = default_folder(source)
-    check_places({"tensorboard": log, "out": made}, inputs)
+    check_places({"tensorboard": log, "out": folder_of(read, out)}, inputs)
     of_type(settings, (Mapping, type(None)), "settings", "a table of settings by name")
     of_type(side, (str, type(None)), "side", "a text")
     seconds = None if seconds is None else real_number(seconds, "seconds")
