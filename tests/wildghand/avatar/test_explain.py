@@ -98,7 +98,7 @@ def test_the_command_writes_a_picture(fitted, tmp_path: Path, capsys) -> None:
     assert "1 frames" in told
     assert "right hand: mean |omega| 0.46, rank correlation with severity not known" in told
     assert read_rgb(out).shape[1] > 4 * capture.info.width
-    assert main(["explain", *given, "--json"]) == 0
+    assert main(["explain", *given, "--overwrite", "--json"]) == 0
     (explained,) = explain_frames(avatar, capture, [frame])
     assert json.loads(capsys.readouterr().out) == {
         "file": str(out),
